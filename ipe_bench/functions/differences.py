@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.linalg import Array, Mask
+from ipe_bench.basics.linalg import Array
 
 Rows = Callable[[Array], Array]
 Near = Callable[[Array, Array], Array]
@@ -35,6 +35,8 @@ _TOLERANCE = 1e-6
 """Part of a slope by which a right one may differ, beside the error of the differences."""
 _SMALL = 1e-3
 """Part of the largest slope of an output below which no slope counts as smaller."""
+_QUICKLY = 1e-7
+"""Part of a slope by which three steps may disagree."""
 _TELLING = 1e-2
 """Part of a slope up to which the error of differences lets them say that it is right."""
 RIGHT, UNKNOWN, WRONG = 0, 1, 2
@@ -218,20 +220,22 @@ def along_units(scale: Array, rows: int) -> Array:
     return np.broadcast_to(np.diag(scale), (rows, len(scale), len(scale)))
 
 
-def by_differences(h: Rows, x: Array, scale: Array, near: Near = unmoved) -> Array:
+def by_differences(
+    h: Rows, x: Array, scale: Array, near: Near = unmoved, within: float = _QUICKLY
+) -> Array:
     """Computes dh/dx (rows, m, n) at x (rows, n) by differences whose widest steps are `scale`
-    (n,): by three steps where these agree, else by the whole ladder, and there by a finer one too
-    where the first leaves an error."""
-    slope, settled = _quick(h, x, scale, near)
-    rows = np.flatnonzero(~settled)
+    (n,): by three steps where these agree `within` a part, else by the whole ladder, and there by a
+    finer one too where the first leaves an error."""
+    slope, apart = quick(h, x, scale, near)
+    rows = np.flatnonzero(~(apart <= within).all(axis=1))
     if rows.size:
         slope[rows] = _by_ladders(h, x[rows], scale, near)
     return slope / scale
 
 
-def _quick(h: Rows, x: Array, scale: Array, near: Near) -> tuple[Array, Mask]:
-    """Returns slopes (rows, m, n) per widest step by three steps of the ladder, and the rows
-    (rows,) where these agree."""
+def quick(h: Rows, x: Array, scale: Array, near: Near = unmoved) -> tuple[Array, Array]:
+    """Returns slopes (rows, m, n) per widest step by three steps of the ladder, and by which part
+    of an output's slopes these disagree at the most (rows, n)."""
     parts = _RATIO ** -np.array(_QUICK, dtype=float)
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -241,14 +245,14 @@ def _quick(h: Rows, x: Array, scale: Array, near: Near) -> tuple[Array, Mask]:
         slope = C[1] + (C[1] - C[0]) / (_RATIO**2 - 1.0)
         size = np.maximum(np.abs(here), np.maximum(np.abs(up), np.abs(down))).max(axis=0)
         noise = (4 * _EPS * size / ahead[-1]).swapaxes(1, 2)
-        largest = np.abs(slope).max(axis=2, keepdims=True)
-        allowed = _TOLERANCE / 10 * np.maximum(np.abs(slope), _SMALL * largest)
         # The finest step finds what the wide ones step over.
-        agree = np.abs(slope - C[2]) <= noise + allowed
-        smooth = np.abs(slope - C[1]) <= _SMALL * largest
+        apart = np.abs(slope - C[2]) - noise
+        # What is extrapolated is no better than a part of its last correction.
+        apart = np.fmax(apart, _QUICKLY * np.abs(slope - C[1]) / _SMALL)
+        largest = np.abs(slope).max(axis=2, keepdims=True)
+        apart = apart / np.maximum(np.abs(slope), _SMALL * largest)
         still = (C == 0.0).all(axis=0)
-        settled = (still | (agree & smooth & (noise <= 10 * allowed))).all(axis=(1, 2))
-    return slope, settled
+        return slope, np.where(still, 0.0, apart).max(axis=1)
 
 
 def _by_ladders(h: Rows, x: Array, scale: Array, near: Near) -> Array:

@@ -19,11 +19,12 @@ from ipe_bench.functions.differences import (
     by_differences,
     judge,
     measured,
+    quick,
     unmoved,
 )
 
 _EPS = np.finfo(float).eps
-_COMPLEX_STEP = 1e-30
+_COMPLEX_STEP = 1e-100
 _AT_ONCE = 16384
 """Bytes of slopes that are computed in a call of a function by complex steps."""
 _NARROW = 1e-3
@@ -36,6 +37,16 @@ _SLOPES = 1e-6
 """Part of a change along that direction by which slopes may differ without a doubt."""
 _MIXED = 1e-6
 """The same, of a row alone and among others."""
+_QUICKLY = 1e-7
+"""Part of a slope by which few differences may disagree in a smooth function, at the least."""
+_ROUGH = 1e-2
+"""The same at the most, in one that is rough, such as by an integrator's tolerance."""
+_NOISIEST = 1e-5
+"""Part of an output's terms by which a function may be rough."""
+_PARTS = 3.0 ** -np.arange(0.0, 16.0, 3.0)
+"""Parts of rough widest steps that are tried."""
+_NARROWER = 3.0**-9
+_MANY_LEVELS = 20
 _LEAST = 1e-4
 """Part of the largest slope below which no slope counts as smaller in that direction."""
 
@@ -70,6 +81,10 @@ class Judged:
     near: Near = unmoved
     why: str = ""
     """Why its slopes are differences; empty if complex steps are tried."""
+    noise: float = 0.0
+    """Part of an output's terms by which it is rougher than round-off."""
+    within: float = _QUICKLY
+    """Part of a slope by which few differences may disagree."""
 
     def __call__(self, x: Array) -> Array:
         return self.function(x)
@@ -83,7 +98,9 @@ class Judged:
             J = self._by_complex_steps(x)
         except Exception:  # functions of `math` and many of SciPy take no complex numbers
             return value, self.differences(x)
-        rows = np.flatnonzero(self.wrong(x, value, J))
+        rows = np.flatnonzero(self._doubted(x, value, J))
+        if rows.size:
+            rows = rows[self.contradicted(x[rows], J[rows])]
         if rows.size:
             J[rows] = self.differences(x[rows])
         return value, J
@@ -94,35 +111,53 @@ class Judged:
             return by_complex_steps(self.function, x)
 
     def differences(self, x: Array) -> Array:
-        return by_differences(self.function, x, self.scale, self.near)
+        return by_differences(self.function, x, self.scale, self.near, self.within)
 
     def wrong(self, x: Array, value: Array, J: Array) -> Mask:
         """Finds the rows (rows,) of x whose values or slopes are not the function's own: along one
         direction, and where that leaves a doubt, along each."""
         with np.errstate(all="ignore"):
-            per_step = np.abs(J) * self.scale
-            per_step = np.where(np.isfinite(per_step), per_step, 0.0)
-            along = _NARROW * self.scale * _direction(per_step)
-            z = np.asarray(self.function(np.concatenate([x, x + along, x - along])), dtype=float)
-            here, up, down = np.split(z, 3)
-            # The terms of an output may be larger than it is.
-            size = np.abs(here) + (per_step * (1.0 + np.abs(x) / self.scale)[:, None]).sum(axis=2)
-            alike = np.abs(self.near(value, here) - here) <= _VALUES * size
+            here = np.asarray(self.function(x), dtype=float)
+            alike = np.abs(self.near(value, here) - here) <= _VALUES * self._size(x, here, J)
             both = ~np.isfinite(value) & ~np.isfinite(here)
-            wrong = ~(alike | both).all(axis=1)
-            moved = (J * along[:, None]).sum(axis=2)
-            ahead = self.near(up, here) - here
-            behind = self.near(down, here) - here
-            change = (ahead - behind) / 2
-            bend = np.abs(ahead + behind) / 2
-            # A difference of one step is off by about its bend squared, but at kinks.
-            most = np.fmin(bend, 4 * bend**2 / np.abs(change))
-            allowed = most + _SLOPES * np.abs(change) + 8 * _EPS * size
-            doubt = np.isfinite(here) & ~(np.abs(change - moved) <= allowed)
-            rows = np.flatnonzero(doubt.any(axis=1) & ~wrong)
+            wrong: Mask = np.any(~(alike | both), axis=1)
+            rows = np.flatnonzero(self._doubted(x, here, J) & ~wrong)
             if rows.size:
                 wrong[rows] = self.contradicted(x[rows], J[rows])
         return wrong
+
+    def _size(self, x: Array, here: Array, J: Array) -> Array:
+        """Returns the size (rows, m) of the terms of the outputs, which may be larger than
+        these."""
+        terms = np.abs(J) * (self.scale + np.abs(x))[:, None]
+        return np.abs(here) + np.where(np.isfinite(terms), terms, 0.0).sum(axis=2)
+
+    def _doubted(self, x: Array, here: Array, J: Array) -> Mask:
+        """Finds the rows (rows,) of x where slopes do not tell what the function, whose values are
+        `here`, does along one direction."""
+        with np.errstate(all="ignore"):
+            rough = self._roughness(x, here, J)
+            beyond = ~(rough <= max(8 * _EPS, self.noise))
+            return np.any(np.isfinite(here) & beyond, axis=1)
+
+    def _roughness(self, x: Array, here: Array, J: Array) -> Array:
+        """Computes by which part of their terms the outputs (rows, m) move otherwise than slopes
+        tell."""
+        per_step = np.abs(J) * self.scale
+        per_step = np.where(np.isfinite(per_step), per_step, 0.0)
+        along = _NARROW * self.scale * _direction(per_step)
+        z = np.asarray(self.function(np.concatenate([x + along, x - along])), dtype=float)
+        up, down = np.split(z, 2)
+        moved = (J * along[:, None]).sum(axis=2)
+        ahead = self.near(up, here) - here
+        behind = self.near(down, here) - here
+        change = (ahead - behind) / 2
+        bend = np.abs(ahead + behind) / 2
+        # A difference of one step is off by about its bend squared, but at kinks.
+        most = np.fmin(bend, 4 * bend**2 / np.abs(change))
+        allowed = most + _SLOPES * np.abs(change)
+        away = np.maximum(np.abs(change - moved) - allowed, 0.0)
+        return np.where(away == 0.0, 0.0, away / self._size(x, here, J))
 
     def contradicted(self, x: Array, J: Array) -> Mask:
         """Finds the rows (rows,) of x with a slope that differences along each number find wrong,
@@ -171,16 +206,47 @@ def judged(
         UserError: the function is random, or mixes rows.
     """
     require_by_row(function, points, what)
-    tried = Judged(function, scale, near)
     with np.errstate(all="ignore"):
+        # How far few differences may disagree is what they do at most of the points.
+        apart = quick(function, points, scale, near)[1].max(axis=1)
+        usual = float(np.median(np.where(np.isfinite(apart), apart, np.inf)))
+        within = min(max(_QUICKLY, 3 * usual), _ROUGH) if usual < _ROUGH else _QUICKLY
+        tried = Judged(function, scale, near, within=within)
         value = np.asarray(tried(points), dtype=float)
         try:
             J = tried._by_complex_steps(points)
         except Exception as error:
             return replace(tried, why=f"it takes no complex numbers ({type(error).__name__})")
-        if 2 * tried.wrong(points, value, J).sum() > len(points):
+        wrong = tried.contradicted(points, J)
+        if 2 * wrong.sum() > len(points):
             return replace(tried, why="complex steps find other slopes than differences")
-    return tried
+        rough = tried._roughness(points, value, J)[~wrong]
+        noise = 3 * float(np.where(np.isfinite(rough), rough, 0.0).max(initial=0.0))
+        return replace(tried, noise=min(noise, _NOISIEST))
+
+
+def widest_steps(h: Rows, x: Array, rough: Array, near: Near = unmoved) -> Array:
+    """Finds the widest steps (n,) for differences at x (n,): parts of rough ones at which few
+    differences find the slopes in nearly all outputs."""
+    here = x[None]
+    with np.errstate(all="ignore"):
+        wide = quick(h, here, rough, near)[0][0]
+        narrow = quick(h, here, _NARROWER * rough, near)[0][0] / _NARROWER
+        # Wide steps may step over what only narrow ones find.
+        if (np.abs(wide - narrow) <= 1e-3 * np.abs(narrow).max(axis=1, keepdims=True)).all():
+            return rough
+        slope, error = measured(h, here, along_units(rough, 1), near, _MANY_LEVELS).central
+        largest = np.abs(slope[0]).max(axis=1, keepdims=True)
+        allowed = np.maximum(3 * error[0], 1e-6 * np.maximum(np.abs(slope[0]), 1e-3 * largest))
+        best = _PARTS[-1] * rough
+        most = np.full(len(rough), 0.0)
+        for part in _PARTS:
+            found = quick(h, here, part * rough, near)[0][0] / part
+            share = (np.abs(found - slope[0]) <= allowed).mean(axis=0)
+            better = share > most + 0.01
+            best = np.where(better, part * rough, best)
+            most = np.where(better, share, most)
+    return best
 
 
 def require_by_row(function: Rows, points: Array, what: str) -> None:

@@ -211,7 +211,7 @@ def _number(graph: ExactGraph, one: Any) -> Expression:
         raise graph.refuse("it computes with complex numbers")
     if not isinstance(one, bool | int | float | np.bool_ | np.number):
         raise graph.refuse(f"its argument meets {type(one).__name__}, which is no number")
-    return graph.constant(one)
+    return graph.constant(float(one))
 
 
 _SAME = {

@@ -4,7 +4,7 @@ order of arrival."""
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
@@ -13,20 +13,12 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.linalg import Array, Covariance, nearest, read_only
+from ipe_bench.basics.linalg import Array, Covariance, nearest
 from ipe_bench.basics.options import Component
-
-_COMPLEX_STEP = 1e-100
-_SMALL = 16384
-"""Bytes of the Jacobians of one call: an eighth as complex numbers of what NumPy calls a large
-array."""
-_CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))
+from ipe_bench.functions.differences import by_differences
+from ipe_bench.functions.judged import by_complex_steps, widest_steps
 
 Epochs = tuple[NDArray[np.intp], ...]
-BatchFunction = Callable[[Array], Array]
-"""Readings (trials, m) at x (trials, n)."""
-Shift = Callable[[Array, Array], Array]
-"""Readings (trials, m) shifted by whole turns next to others, as `Measurement.near` does."""
 
 
 @dataclass(frozen=True)
@@ -277,9 +269,18 @@ class Measurement(Component, ABC):
         raise NotImplementedError(f"{self.name} has no bounds")
 
     def jacobian(self, x: Array) -> Array:
-        """Computes dh/dx: (trials, n) -> (trials, m, n); complex step where analytic, else central
-        differences."""
-        return differentiate(self.simulate, x, analytic=self.analytic, near=self.near)
+        """Computes dh/dx: (trials, n) -> (trials, m, n); complex step where analytic, else
+        differences that know their error."""
+        if self.analytic:
+            return by_complex_steps(self.simulate, x)
+        return by_differences(self.simulate, x, self.widest_steps, self.near)
+
+    @cached_property
+    def widest_steps(self) -> Array:
+        """The widest steps (n,) of differences: a tenth of the nominal values or of 1, or less
+        where the readings bend within that."""
+        x0 = np.asarray(self.nominal, dtype=float)
+        return widest_steps(self.simulate, x0, 0.1 * np.maximum(1.0, np.abs(x0)), self.near)
 
     def coarse_jacobian(self, x: Array) -> Array:
         """Computes dh/dx near enough for the steps of an iteration, `|I - J~+ J|` below 0.01, where
@@ -289,7 +290,7 @@ class Measurement(Component, ABC):
     @property
     def jacobian_cost(self) -> float:
         """Cost of a Jacobian, in simulations of the same trial."""
-        return float(self.n if self.analytic else 2 * self.n)
+        return float(self.n if self.analytic else 6 * self.n)
 
     @property
     def coarse_jacobian_cost(self) -> float:
@@ -544,75 +545,3 @@ class SubsetModel(Forwarding):
 
     def linearization(self) -> Array:
         return self.whole.linearization()[self._rows]
-
-
-def differentiate(
-    h: BatchFunction, x: Array, *, analytic: bool, near: Shift = lambda h, z: h
-) -> Array:
-    """Computes dh/dx (trials, m, n) of a batched function h at x (trials, n), all directions in one
-    call of h; `near` shifts angles by whole turns next to others.
-
-    Analytic functions: complex step, exact to round-off (Squire and Trapp, SIAM Review 40, 1998).
-    Others: central differences with a step of eps^(1/3) in units of the parameter, or of its value
-    where that is larger.
-    """
-    if analytic:
-        return _by_complex_step(h, x)
-    trials, n = x.shape
-    size = _CENTRAL_STEP * np.maximum(1.0, np.abs(x))
-    above = x + size
-    below = x - size
-    # Half the distance as it is in floating point, which differs from `size` by round-off.
-    steps = np.eye(n)[None] * (above - below)[:, None, :] / 2
-    points = np.stack([x[:, None] + steps, x[:, None] - steps])
-    ahead, behind = h(read_only(points.reshape(-1, n))).reshape(2, trials, n, -1)
-    ends = np.diagonal(points, axis1=2, axis2=3)
-    width = (ends[0] - ends[1])[:, :, None]
-    slopes = (near(ahead, behind) - behind) / width
-    return np.ascontiguousarray(slopes.swapaxes(1, 2))
-
-
-def _by_complex_step(h: BatchFunction, x: Array) -> Array:
-    """Computes dh/dx (trials, m, n) as Im h(x + i eps e_k) / eps."""
-    trials, n = x.shape
-    # A few trials in a call: NumPy multiplies complex numbers with other rounding where it reuses a
-    # large temporary array for the product, so in one call of all trials the bits of each would
-    # depend on how many there are.
-    parts: list[Array] = []
-    begun = 0
-    few = 1
-    while begun < trials or not parts:
-        points = x[begun : begun + few, None, :] + np.eye(n) * _COMPLEX_STEP * 1j
-        moved = np.imag(h(read_only(points.reshape(-1, n))))
-        parts.append(moved.reshape(len(points), n, moved.shape[-1]).swapaxes(1, 2))
-        begun += few
-        few = max(1, int(_SMALL / max(parts[0][:1].nbytes, 1)))
-    return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP
-
-
-def contradicted(h: BatchFunction, x: Array, J: Array, near: Shift) -> NDArray[np.bool_]:
-    """Finds the trials (trials,) whose central differences of h along a direction contradict J =
-    dh/dx (trials, m, n).
-
-    Two calls per trial, whatever n is. Every parameter changes the readings by about as much, none
-    by a multiple of what another does, so that a wrong column shows beside larger ones.
-    """
-    trials, n = x.shape
-    unit = np.maximum(1.0, np.abs(x))
-    largest = np.nan_to_num(np.fmax.reduce(np.abs(J), axis=1), posinf=0.0)
-    size = largest * unit + np.finfo(float).tiny
-    weight = 1.0 / np.maximum(size, 1e-4 * size.max(axis=1, keepdims=True))
-    weight *= np.random.default_rng(1).uniform(0.5, 1.0, n) / weight.max(axis=1, keepdims=True)
-    step = _CENTRAL_STEP * unit * weight
-    above = x + step
-    below = x - step
-    z = h(read_only(np.concatenate([above, below])))
-    ahead = z[:trials]
-    behind = z[trials:]
-    with np.errstate(all="ignore"):
-        change = near(ahead, behind) - behind
-        expected = (J * (above - below)[:, None]).sum(axis=2)
-        rounding = 100 * np.finfo(float).eps * np.fmax.reduce(np.abs(ahead), axis=1)
-        tolerated = 1e-5 * _CENTRAL_STEP * (size * weight).sum(axis=1) + rounding
-        alike = np.abs(change - expected) <= tolerated[:, None]
-    return (np.isfinite(change) & ~alike).any(axis=1)

@@ -8,7 +8,6 @@ import inspect
 import os
 import sys
 import typing
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError, place_of, refuse_unknown, unknown
 from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.options import Finite, Positive
-from ipe_bench.measurements.base import contradicted, differentiate
+from ipe_bench.functions.judged import Judged, judged
 from ipe_bench.measurements.formula import WrittenModel
 
 _CHUNK = 8
@@ -42,9 +41,9 @@ class Function(WrittenModel):
     Arguments with a number as default are parameters, which start there; arguments without are
     columns of the readings file, arrays (m,); keyword-only arguments are constants. h returns the
     readings (m,). The type `Annotated[float, "m"]` gives a parameter its unit. Slopes are exact: by
-    forward differentiation where h returns JAX arrays, by a complex step where differences agree
-    with it, else by central differences. Readings that have a column `t` or `time` arrive in that
-    order, so that filters take part.
+    forward differentiation where h returns JAX arrays, by a complex step where differences do not
+    contradict it, else by differences that know their error. Readings that have a column `t` or
+    `time` arrive in that order, so that filters take part.
     """
 
     of: str
@@ -256,18 +255,11 @@ class Function(WrittenModel):
         return readings, slopes
 
     @cached_property
-    def _is_analytic(self) -> bool:
-        """Whether complex steps give the slopes that differences give, near the start and away from
-        it."""
+    def _judged(self) -> Judged:
+        """The function with its slopes, tried near the start and away from it."""
         offsets = np.random.default_rng(1).uniform(-0.3, 0.3, (4, self.n))
-        x = self.nominal + np.vstack([np.zeros(self.n), offsets])
-        J = self._by_complex_step(x)
-        return not contradicted(self._rows, x, J, self.near).any()
-
-    def _by_complex_step(self, x: Array) -> Array:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", np.exceptions.ComplexWarning)
-            return differentiate(self._rows, x, analytic=True)
+        points = self.nominal + np.vstack([np.zeros(self.n), offsets])
+        return judged(self._rows, points, self.widest_steps, self.near, f"measurement.of={self.of}")
 
     def remarks(self, x: Array) -> tuple[str, ...]:
         return self.flat(x)
@@ -278,20 +270,13 @@ class Function(WrittenModel):
     def jacobian(self, x: Array) -> Array:
         if self._jax is not None:
             return self._jax[1](x)
-        if not self._is_analytic:
-            return differentiate(self._rows, x, analytic=False, near=self.near)
-        J = self._by_complex_step(x)
-        # In a branch that is not analytic.
-        wrong = contradicted(self._rows, x, J, self.near)
-        if wrong.any():
-            J[wrong] = differentiate(self._rows, x[wrong], analytic=False, near=self.near)
-        return J
+        return self._judged.slopes(x)[1]
 
     @property
     def jacobian_cost(self) -> float:
         if self._jax is not None:
             return float(self.n)
-        return float(self.n + 2 if self._is_analytic else 2 * self.n)
+        return float(6 * self.n if self._judged.why else self.n + 3)
 
 
 def function(

@@ -17,7 +17,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, Mask, deviations, multiply, own
 from ipe_bench.engine.rows import RowFunction
-from ipe_bench.functions.judged import Judged, judged, same_values
+from ipe_bench.functions.judged import Judged, judged, require_by_row, same_values
 from ipe_bench.functions.recording import NotRecorded, Written, compiled_rows, written
 from ipe_bench.states.algebra import root
 
@@ -299,26 +299,32 @@ class _Side:
             each = [one._replace(own=[self.own[k] for k in one.epochs]) for one in recordings]
             self.functions = EpochFunctions(each)
 
-    def _call_by_epoch(self, why: str, why_differences: str = "") -> None:
+    def _call_by_epoch(self, why: str, as_found: Judged | None = None) -> None:
+        """Calls the model's own function epoch by epoch, with slopes as they were found best."""
+        if as_found:
+            how = {part: getattr(as_found, part) for part in ("why", "noise", "within")}
+            self.own = {k: replace(one, **how) for k, one in self.own.items()}
         none = np.empty((1, 0))
-        self.own = {k: replace(one, why=why_differences) for k, one in self.own.items()}
         recordings = [Recording(one, np.array([k]), none) for k, one in self.own.items()]
-        self.functions = EpochFunctions(recordings, why, why_differences)
+        self.functions = EpochFunctions(recordings, why, as_found.why if as_found else "")
 
     def hold(self, k: int, x: Array) -> None:
         """Tries the function of epoch k at points x (points, n), of which the first is the mean."""
         if k not in self.own:
             return
+        one = self.own[k]
         if not self.functions.why:
-            why = _unlike(self.functions.at[k], self.own[k], x)
+            require_by_row(one.function, x, self.name)
+            why = _unlike(self.functions.at[k], one, x)
             if not why:
                 return
             self._call_by_epoch(f"at epoch {k + 1} its recording has {why}")
-        if not self.functions.why_differences:
-            one = self.own[k]
-            found = judged(one.function, x, one.scale, one.near, self.name)
-            if found.why:
-                self._call_by_epoch(self.functions.why, found.why)
+        found = judged(one.function, x, one.scale, one.near, self.name)
+        if self.functions.why_differences:
+            return
+        noise = max(found.noise, one.noise)
+        within = max(found.within, one.within)
+        self._call_by_epoch(self.functions.why, replace(found, noise=noise, within=within))
 
 
 def _unlike(recorded: Recording, own: Judged, x: Array) -> str:

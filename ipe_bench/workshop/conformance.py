@@ -21,9 +21,10 @@ from ipe_bench.basics.linalg import Array, deviations, finite
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
 from ipe_bench.estimators.ipe import IPE, State, begin
+from ipe_bench.functions.differences import WRONG, along_units, judge, measured
 from ipe_bench.functions.judged import same_values
 from ipe_bench.measurements import Polynomial, Sir
-from ipe_bench.measurements.base import Measurement, UsualNoise, differentiate
+from ipe_bench.measurements.base import Measurement, UsualNoise
 from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, ModelNoise
@@ -443,14 +444,14 @@ def differentiates(model: Measurement) -> None:
     """Has the Jacobian that differences of its readings show."""
     x = _points(model)
     J = model.jacobian(x)
-    differences = differentiate(model.simulate, x, analytic=False)
     _shaped("what jacobian returns", J, (len(x), model.m, model.n), "(trials, m, n)")
-    # Differences cannot tell more than the round-off of h over their step.
-    readings = np.abs(model.simulate(x)).max()
-    round_off = 10 * np.finfo(float).eps ** (2 / 3) * readings
+    scale = model.widest_steps
+    found = measured(model.simulate, x, along_units(scale, len(x)), model.near)
+    wrong = judge(J * scale, found) == WRONG
+    differences = found.central.slope / scale
     largest = np.abs(differences).max(axis=1, keepdims=True) + 1e-300
-    excess = np.maximum(np.abs(J - differences) - round_off, 0.0)
-    off = np.nan_to_num(excess / largest, nan=np.inf)
+    off = np.nan_to_num(np.abs(J - differences) / largest, nan=np.inf)
+    off = np.where(wrong, off, 0.0)
     at = _largest(off)
     _, i, j = at
     entries = [f"{name}={column[i]}" for name, column in model.index.items()]
@@ -461,7 +462,7 @@ def differentiates(model: Measurement) -> None:
             " the like do not survive: write np.where(u.real < 0, -u, u) for np.abs(u), or leave"
             " `analytic` out"
         )
-    assert off[at] < 1e-5, (
+    assert off[at] < 1e-6, (
         f"it is off by {off[at]:.1e} of a column's largest entry, most for parameter"
         f" {model.parameters[j].name} in reading {', '.join(entries)}: it says {J[at]:.6g}, and"
         f" differences {differences[at]:.6g}{hint}"

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853
 from shared.oracles import agreed, assert_agrees
+from shared.slopes import differentiate
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.engine import plan
 from ipe_bench.engine.ladder import tangent_contraction
 from ipe_bench.engine.trace import Graph
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
-from ipe_bench.measurements.base import differentiate
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,14 @@ import pandas as pd
 import pytest
 from shared.estimator_checks import ALL
 from shared.families import slow_if
+from shared.slopes import differentiate
 
 import ipe_bench as ib
 from ipe_bench.baselines import IPLF, EnKF, IteratedEKF, LevenbergMarquardt, LinearLSE
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.main import main
 from ipe_bench.measurements import Formula, Function, Ode
-from ipe_bench.measurements.base import SubsetModel, differentiate
+from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import Gaussian, Quantization

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from shared.by_numpy import by_numpy
 from shared.oracles import assert_agrees
+from shared.slopes import differentiate
 
 from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Ode
-from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode.driven import course
 from ipe_bench.noise import Gaussian
 from ipe_bench.real.estimation import Question

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shared.oracles import agreed, assert_agrees
+from shared.slopes import differentiate
 
 import ipe_bench as ib
 from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula, Nist
 from ipe_bench.measurements.arithmetic import parse
-from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.nist import digits
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Unknown

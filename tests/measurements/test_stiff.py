@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from shared.oracles import assert_agrees
+from shared.slopes import differentiate
 
 from ipe_bench.engine.rodas import Rodas5P
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
-from ipe_bench.measurements.base import differentiate
 
 # fmt: off
 HIRES = {
