@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import getpass
+import hashlib
 import json
 import os
 import socket
@@ -88,6 +89,40 @@ def cache_folder() -> Path:
             with tempfile.TemporaryFile(dir=folder):
                 return folder
     return Path(os.devnull)  # below which nothing can be kept
+
+
+def kept(made_of: str, suffix: str, make: Callable[[], bytes]) -> bytes:
+    """Returns the content that a text identifies, made once per machine and kept in the cache.
+
+    A kept file is used only if it was made of this text, is whole, and belongs to this user or the
+    system.
+    """
+    # It begins with the digests of what it was made of and of its content; others are made anew.
+    of = hashlib.sha256(made_of.encode()).digest()
+    path = cache_folder() / f"{of.hex()[:32]}{suffix}"
+    stored = _own_bytes(path)
+    content = stored[2 * len(of) :]
+    if stored[: 2 * len(of)] != of + hashlib.sha256(content).digest():
+        content = make()
+        stored = of + hashlib.sha256(content).digest() + content
+        with contextlib.suppress(StorageError):
+            write_atomically(
+                path, lambda temporary: (temporary.write_bytes(stored), temporary.chmod(0o600))
+            )
+    return content
+
+
+def _own_bytes(path: Path) -> bytes:
+    """Reads a file that belongs to this user or the system and is writable by no other user;
+    returns b"" otherwise."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        about = os.fstat(file.fileno())
+        foreign = os.name == "posix" and (
+            about.st_uid not in (0, os.geteuid()) or about.st_mode & 0o022
+        )
+        return b"" if foreign else file.read()
 
 
 def _chosen_cache() -> Path:

@@ -23,7 +23,7 @@ def _described(estimators: Any) -> dict[str, Any]:
 def estimate_command(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit
     passes."""
-    from ipe_bench.report.page.answer import FILES, NAME, Answer, write_answer
+    from ipe_bench.report.page.answer import FILES, NAME, Answer, store, write_page
 
     asked = single(
         "estimate", arguments, standard_words(arguments), run=(*of("run", "trials"), w.TRUTH)
@@ -46,9 +46,9 @@ def estimate_command(arguments: Sequence[str]) -> int:
     drawn = asked.spec.figures != "none"
     with asked.folder(NAME, command, FILES) as folder:
         answer = Answer.to(question, asked.measurement, "lines")
-        files = write_answer(folder, answer, command, provenance, figures=drawn)
-    show(answer.parts())
-    say_files(files)
+        stored = store(folder, answer, command, provenance)
+    show(answer.parts())  # before what takes longest, so that who stops there has the numbers
+    say_files([stored, *write_page(folder, answer, provenance, figures=drawn)])
     return 0 if answer.passes else 1
 
 
@@ -63,7 +63,7 @@ def _track(asked: Single, model: StateModel) -> int:
     """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where
     no track passes."""
     from ipe_bench.real.logs import LogQuestion
-    from ipe_bench.report.page.log import NAME, TABLE, LogAnswer, write_tracks
+    from ipe_bench.report.page.log import NAME, TABLE, LogAnswer, store, write_page
 
     asked.words.refuse(
         ("error_scale",), "is of simulated trials; give the state model another prior"
@@ -84,9 +84,9 @@ def _track(asked: Single, model: StateModel) -> int:
     drawn = spec.figures != "none"
     with asked.folder(NAME, command, [TABLE]) as folder:
         answer = LogAnswer.to(question, "lines")
-        written = write_tracks(folder, answer, command, provenance, figures=drawn)
+        stored = store(folder, answer, command, provenance)
     show(answer.parts())
-    say_files(written)
+    say_files([stored, *write_page(folder, answer, provenance, figures=drawn)])
     return 0 if answer.passes else 1
 
 

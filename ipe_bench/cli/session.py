@@ -171,17 +171,19 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
         jobs = [list(words.overrides)]
         specs = [spec_of(config)]
     typed = any(one.is_hydra_override() for one in words.overrides)
-    if typed or _told(hydra) != _told(_composed((), whole=True).hydra):
+    ours = hydra.launcher["_target_"].endswith(".BasicLauncher")
+    if typed or not ours or _told_by_folder(hydra):
         return Jobs(words, specs, multirun)
     return Jobs(words, specs, multirun, told=[list(map(w.forced, job)) for job in jobs])
 
 
-def _told(hydra: DictConfig) -> dict[str, Any]:
-    """Returns what Hydra is told to do about jobs besides running them."""
-    said: Any = OmegaConf.to_container(hydra, resolve=False)
-    job = {key: said["job"][key] for key in ("chdir", "env_set", "env_copy")}
-    keys = ("callbacks", "hydra_logging", "job_logging", "launcher")
-    return {**job, **{key: said[key] for key in keys}}
+def _told_by_folder(hydra: DictConfig) -> bool:
+    """Returns whether a folder of a person's tells Hydra more about jobs than to run them."""
+    if PluginConfigs.folder is None:
+        return False
+    plain = _composed((), whole=True).hydra
+    keys = ("callbacks", "hydra_logging", "job_logging", "job.chdir", "job.env_set", "job.env_copy")
+    return any(OmegaConf.select(hydra, key) != OmegaConf.select(plain, key) for key in keys)
 
 
 def _swept(words: Words, params: Sequence[str]) -> list[list[Override]]:

@@ -13,7 +13,6 @@ import functools
 import hashlib
 import importlib.metadata
 import logging
-import os
 import sys
 from collections.abc import Callable, Iterator
 from ctypes.util import find_library
@@ -22,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import StorageError, UserError, one_line
-from ipe_bench.basics.files import cache_folder, write_atomically
+from ipe_bench.basics.errors import UserError, one_line
+from ipe_bench.basics.files import cache_folder, kept
 
 _LOG = logging.getLogger(__name__)
 
@@ -53,7 +52,6 @@ _IN_LIBRARY = (
 _IN_LIBRARY += ("fma", "memset", "memcpy")
 """Functions of the C library that machine code may call: those of recorded programs, and those LLVM
 puts in place of an instruction that the processor lacks or of a loop."""
-_DIGEST = 32
 
 POINTER, INTEGER = ctypes.c_void_p, ctypes.c_int64
 
@@ -121,45 +119,22 @@ def load(
     target = _target()
     import llvmlite.binding as llvm
 
-    # The file begins with the digests of what it was made of and of its code; others are made anew.
-    made_of = hashlib.sha256(repr((name, key, _machine())).encode()).digest()
-    path = cache_folder() / f"{made_of.hex()[:32]}.o"
-    content = _own_bytes(path)
-    code = content[2 * _DIGEST :]
-    if content[: 2 * _DIGEST] != made_of + hashlib.sha256(code).digest():
-        _LOG.info("compiling a model, once per machine: it is kept in %s", path.parent)
-        code = _object_code(write())
-        content = made_of + hashlib.sha256(code).digest() + code
-        with contextlib.suppress(StorageError):
-            write_atomically(
-                path, lambda temporary: (temporary.write_bytes(content), temporary.chmod(0o600))
-            )
+    made_of = repr((name, key, _machine()))
+    code = kept(made_of, ".o", lambda: _object_code(write()))
     # The object is linked against the functions of the C library that it may call.
     library = llvm.JITLibraryBuilder().add_object_img(code).export_symbol(name)
     for called, address in _addresses().items():
         library.import_symbol(called, address)
     engine = llvm.create_lljit_compiler(target)
-    tracker = library.link(engine, made_of.hex())
+    tracker = library.link(engine, hashlib.sha256(made_of.encode()).hexdigest())
     function = ctypes.CFUNCTYPE(None, *arguments)(tracker[name])
     # The code lives as long as the function that calls it.
     function.keeps = engine, tracker  # type: ignore[attr-defined]
     return function
 
 
-def _own_bytes(path: Path) -> bytes:
-    """Reads a file that belongs to this user or the system and is writable by no other user;
-    returns b"" otherwise."""
-    if not path.is_file():
-        return b""
-    with path.open("rb") as file:
-        about = os.fstat(file.fileno())
-        foreign = os.name == "posix" and (
-            about.st_uid not in (0, os.geteuid()) or about.st_mode & 0o022
-        )
-        return b"" if foreign else file.read()
-
-
 def _object_code(text: str) -> bytes:
+    _LOG.info("compiling a model, once per machine: it is kept in %s", cache_folder())
     import llvmlite.binding as llvm
 
     module = llvm.parse_assembly(text)

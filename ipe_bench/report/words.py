@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ipe_bench import __version__
-from ipe_bench.trials.thresholds import HELD
 
 CITATION = (
     f"The ipe-bench developers (2026). ipe-bench, version {__version__} [computer program]. Beside"
@@ -60,6 +59,8 @@ def share_text(share: float) -> str:
     Halves go up, and none is rounded to all, to none or to the share from which on an estimator
     succeeds.
     """
+    from ipe_bench.trials.thresholds import HELD  # late: loads NumPy, which help does without
+
     if not math.isfinite(share):
         return "-"
     if share in (0, 1):

@@ -228,3 +228,27 @@ def test_a_base_class_in_another_module_is_part_of_the_source(copy):
     before = said(code, copy)
     edit(copy / "ipe_bench/baselines/least_squares.py", "FACTOR = 2", "FACTOR = 3")
     assert said(code, copy) != before
+
+
+def test_what_is_kept_of_our_sources_is_read_anew_after_an_edit(tmp_path, monkeypatch):
+    """Even of one that leaves size and time as they were, as an installation may."""
+    monkeypatch.setenv("IPE_BENCH_CACHE", str(tmp_path / "cache"))
+    file = tmp_path / "room.py"
+    monkeypatch.setattr(provenance, "_file_of", lambda module: file)
+    file.write_text("import ipe_bench.noise\nA = 1\n")
+    about = file.stat()
+
+    def found() -> tuple[str, frozenset[str]]:
+        provenance._source_when.cache_clear()
+        return provenance._source_of("ipe_bench.room")
+
+    first = found()
+    assert first[1] == {"ipe_bench.noise"}
+    with monkeypatch.context() as patch:
+        patch.setattr(provenance.ast, "parse", None)
+        assert found() == first
+    file.write_text("import ipe_bench.noise\nA = 2\n")
+    os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
+    assert file.stat().st_size == about.st_size
+    assert found()[0] != first[0]
+    provenance._source_when.cache_clear()

@@ -18,7 +18,7 @@ import ipe_bench as ib
 from ipe_bench.measurements import Parameter
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import options
-from ipe_bench.report.page.log import write_tracks
+from ipe_bench.report.page.log import write_page
 from ipe_bench.states import Bootstrap, Formulas, IteratedSmoother, Smoother, ckf, ekf, ukf
 from ipe_bench.states.damped import LevenbergMarquardtSmoother
 from ipe_bench.states.ipe import PathIPE
@@ -170,7 +170,7 @@ three times those of readings and a fiftieth of those of the walk, so that innov
 def test_the_title_of_a_page_has_the_verdict_on_a_log_of_known_truth(verdict, tmp_path):
     z = TRUTHS[verdict].draw(0, 1).z[0]
     answer = ib.estimate(FOLLOWED, z, {"kf": ekf(), "ukf": ukf(), "rts": Smoother(ekf())})
-    write_tracks(tmp_path, answer, {}, {}, figures=False)
+    write_page(tmp_path, answer, {}, figures=False)
     page = (tmp_path / "track.html").read_text(encoding="utf-8")
     assert f"<title>{FOLLOWED.name}: kf, ukf, rts {verdict} ·" in page
     assert "Smoothers, which use later readings: rts." in page
@@ -179,7 +179,7 @@ def test_the_title_of_a_page_has_the_verdict_on_a_log_of_known_truth(verdict, tm
 def test_the_title_of_a_page_names_the_trackers_of_each_verdict(tmp_path):
     sharp = replace(FOLLOWED, deviation={"z": 1e-3})
     few = {"kf": ekf(), "few": Bootstrap(3), "other": ukf()}
-    write_tracks(tmp_path, ib.estimate(sharp, FOLLOWED.draw(0, 1).z[0], few), {}, {}, figures=False)
+    write_page(tmp_path, ib.estimate(sharp, FOLLOWED.draw(0, 1).z[0], few), {}, figures=False)
     page = (tmp_path / "track.html").read_text(encoding="utf-8")
     assert f"<title>{FOLLOWED.name}: kf, other overconfident; few collapsed ·" in page
 
@@ -193,7 +193,7 @@ def test_titles_are_false_on_as_few_logs_as_their_limits_say(verdict, least, mos
     the model; and none is called consistent, if its deviations are three times as large."""
     titles = []
     for z in TRUTHS[verdict].draw(0, 100).z:
-        write_tracks(tmp_path, ib.estimate(FOLLOWED, z, {"kf": ekf()}), {}, {}, figures=False)
+        write_page(tmp_path, ib.estimate(FOLLOWED, z, {"kf": ekf()}), {}, figures=False)
         titles.append((tmp_path / "track.html").read_text(encoding="utf-8"))
     called = sum(f"<title>{FOLLOWED.name}: kf consistent ·" in title for title in titles)
     assert least <= called <= most

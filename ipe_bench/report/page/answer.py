@@ -586,17 +586,19 @@ def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
     return ", ".join(words)
 
 
-def write_answer(
-    folder: Path,
-    answer: Answer,
-    command: Any,
-    provenance: Mapping[str, Any],
-    *,
-    figures: bool = True,
-) -> list[Path]:
-    """Writes estimate.json, the page, residuals.csv and the figure; returns the files."""
+def store(folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any]) -> Path:
+    """Writes estimate.json, which has every estimate, and returns its path."""
     content = {"schema": SCHEMA, "command": command, **estimate_content(answer), **provenance}
-    write_json(folder / f"{NAME}.json", content)
+    path = folder / f"{NAME}.json"
+    write_json(path, content)
+    return path
+
+
+def write_page(
+    folder: Path, answer: Answer, provenance: Mapping[str, Any], *, figures: bool = True
+) -> list[Path]:
+    """Writes residuals.csv, the page and its figures, in place of those of an earlier answer;
+    returns the files."""
     files = write_files(
         folder,
         NAME,
@@ -610,7 +612,7 @@ def write_answer(
     )
     for old in {folder / each for each in FILES} - set(files):
         old.unlink(missing_ok=True)
-    return [folder / f"{NAME}.json", *files]
+    return files
 
 
 def _drawings(answer: Answer) -> Iterator[Drawing]:

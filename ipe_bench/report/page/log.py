@@ -161,22 +161,23 @@ class LogAnswer(Labelled[LogTracks]):
         return [Table("constants", "Constants of largest likelihood", "", columns)]
 
 
-def write_tracks(
-    folder: Path,
-    answer: LogAnswer,
-    command: Any,
-    provenance: Mapping[str, Any],
-    *,
-    figures: bool = True,
+def store(folder: Path, answer: LogAnswer, command: Any, provenance: Mapping[str, Any]) -> Path:
+    """Writes track.json and returns its path."""
+    content = {"schema": SCHEMA, "command": command, "trackers": _trackers(answer), **provenance}
+    path = folder / f"{NAME}.json"
+    write_json(path, content)
+    return path
+
+
+def write_page(
+    folder: Path, answer: LogAnswer, provenance: Mapping[str, Any], *, figures: bool = True
 ) -> list[Path]:
-    """Writes track.json, track.csv, track.html and the picture; returns the files."""
+    """Writes track.csv, track.html and its pictures; returns the files."""
     from ipe_bench.report.figures.log import draw_log
 
-    content = {"schema": SCHEMA, "command": command, "trackers": _trackers(answer), **provenance}
-    write_json(folder / f"{NAME}.json", content)
     log = answer.log
     readings = int(np.isfinite(log.z).sum())
-    files = write_files(
+    return write_files(
         folder,
         NAME,
         (TABLE, answer.table()),
@@ -187,7 +188,6 @@ def write_tracks(
         facts=[f"{readings} readings at {log.model.epochs} epochs"],
         sources=read_from(provenance),
     )
-    return [folder / f"{NAME}.json", *files]
 
 
 def _trackers(answer: LogAnswer) -> dict[str, dict[str, Any]]:
