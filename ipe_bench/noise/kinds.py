@@ -152,7 +152,7 @@ class Outliers(ScaledNoise):
     >>> for assumed in ("nominal", "total"):
     ...     noise = ib.noise.Outliers(0.1, assumed=assumed)
     ...     bench = ib.Scenario(ib.measurements.Polynomial(), noise, error_scale=0.1)
-    ...     print(assumed, ib.run(bench, lm, trials=20).iloc[-1]["nees"] < 1.5)
+    ...     print(assumed, ib.run(bench, lm, trials=20).iloc[-1]["nees_solved"] < 1.5)
     nominal False
     total True
     """

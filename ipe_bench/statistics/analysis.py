@@ -66,9 +66,9 @@ class Analysis:
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty if no file
     says so."""
     tracks: pd.DataFrame
-    """Errors of each state of a tracker: time `at` of each epoch, `rmse`, `bound` at the truth,
-    `posterior` and `posterior_smoothed` Cramér-Rao bounds, and `nees` over n with the ends of its
-    limits."""
+    """Errors of each state of a tracker, and of all: time `at` of each epoch, `median` and worst
+    tenth `q90` over all `trials`, `bound` at the truth, `posterior` and `posterior_smoothed`
+    Cramér-Rao bounds, and `nees_solved` over n of the `claims` with the ends of its limits."""
 
     one_track: pd.DataFrame
     """One trial of each scenario: `truth`, `mean` and `deviation` of each tracker's states at each

@@ -17,18 +17,18 @@ from ipe_bench.basics.linalg import Array, divisors, finite, finite_or
 from ipe_bench.statistics.calibration import overall_words
 from ipe_bench.statistics.intervals import (
     LEVEL,
+    MeanNees,
     Squares,
     capped_interval,
     few_carry,
     mean_limits,
+    mean_nees,
     quantile,
     rms_interval,
     rms_sequence,
     unseen,
-    verdict,
 )
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, FLOOR, NIS, Sample
-from ipe_bench.statistics.verdicts import Verdict
 from ipe_bench.trials.thresholds import FIT_LEVEL, gate
 
 T = TypeVar("T")
@@ -443,11 +443,17 @@ def coverage(s: Sample) -> Any:
     return np.append(each, share(inside))
 
 
-def verdict_on(nees: Array, degrees: int, s: Sample) -> Verdict:
-    """Words the NEES of the converged trials at a level that all verdicts of a setting share
-    (Bonferroni): where all covariances are right, none is called wrong in 95 % of the reports."""
+def mean_nees_of(nees: Array, degrees: int, s: Sample) -> MeanNees:
+    """Computes the mean NEES of the converged trials with its interval at a level that all verdicts
+    of a setting share (Bonferroni): where all covariances are right, none is called wrong in 95 %
+    of the reports."""
     level = 1 - (1 - LEVEL) / s.verdicts
-    return verdict(nees[s.converged], degrees, level)
+    return mean_nees(nees[s.converged], degrees, level)
+
+
+@once
+def claimed(s: Sample) -> MeanNees:
+    return mean_nees_of(s.scalars["nees"], s.n, s)
 
 
 def calibration_p(s: Sample) -> Any:

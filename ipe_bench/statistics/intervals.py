@@ -20,6 +20,7 @@ from ipe_bench.basics.streams import generator
 from ipe_bench.statistics.verdicts import (
     CONSISTENT,
     NO_VERDICT,
+    NOT_REFUTED,
     OVERCONFIDENT,
     TOO_CAUTIOUS,
     UNDECIDED,
@@ -56,6 +57,10 @@ RARE = 10
 UNSEEN_NEES = 50.0
 """NEES over its degrees assumed in unseen trials: that of errors ten times larger in one trial of a
 hundred, or of any size in one of fifty, where the covariance is right."""
+EXCLUDED = 1.5
+"""Factor of the variance that is excluded where a covariance is called consistent."""
+_FARTHEST = 40.0
+"""Logarithm of the ratio to their mean below which nothing is sought."""
 _BETS = 0.99 * 2.0 ** -np.arange(9)
 """Shares of the stake."""
 
@@ -308,35 +313,75 @@ def mean_limits(degrees: float, trials: int, level: float = LEVEL) -> tuple[floa
     return float(low), float(high)
 
 
-def verdict(nees: Array, n: int, level: float = LEVEL) -> Verdict:
-    """Words the value of an estimator's own covariance: by the NEES (trials,) of the trials that it
-    calls converged, as `scoring.nees` returns them, for n parameters; none for fewer than `FEW`.
+@dataclass(frozen=True)
+class MeanNees:
+    """Holds the mean of NEES / n with the interval from which the verdict is read."""
 
-    Overconfident, too cautious: the mean of NEES / n surely lies above or below 1. Above 1 it does
-    by bets on it, for any law of the errors, or by the interval that root mean squares have; below
-    1 it does if it would by that interval with a NEES / n of `UNSEEN_NEES` in the share of trials
-    that may be `unseen`, and is undecided if it only seems to. Where few trials carry the mean
-    there is no such interval: bets alone decide. A trial whose NEES is NaN made no claim and is
-    left out.
+    claims: int
+    """Trials that claim a covariance."""
+    mean: float
+    low: float
+    """NaN for fewer than `FEW` claims."""
+    high: float
+    """The largest factor of the variance that these trials do not exclude; NaN where few of them
+    carry the mean, or for fewer than `FEW`."""
+    with_unseen: float
+    """The same with a NEES / n of `UNSEEN_NEES` in the share of trials that may be `unseen`."""
+
+    @property
+    def verdict(self) -> Verdict:
+        if self.claims < FEW:
+            return NO_VERDICT
+        if self.low > 1:
+            return OVERCONFIDENT
+        if np.isnan(self.high):
+            return UNDECIDED
+        if self.high < 1:
+            return TOO_CAUTIOUS if self.with_unseen < 1 else UNDECIDED
+        return CONSISTENT if self.high <= EXCLUDED else NOT_REFUTED
+
+
+def mean_nees(nees: Array, n: int, level: float = LEVEL) -> MeanNees:
+    """Computes the mean NEES / n of n parameters with its interval, from the NEES (trials,) of the
+    trials that an estimator calls converged, as `scoring.nees` returns them.
+
+    The lower end is by bets, for any law of the errors, or by the interval that root mean squares
+    have, whichever is larger. Where few trials carry the mean there is no such interval: bets alone
+    count. A trial whose NEES is NaN made no claim and is left out.
     """
-    claims = nees[~np.isnan(nees)]
-    if len(claims) < FEW:
-        return NO_VERDICT
-    x = np.minimum(claims / n, 1e150)
-    if _evidence_above_1(x) >= 2 / (1 - level):
-        return OVERCONFIDENT
+    x = nees[~np.isnan(nees)] / n
+    mean = float(np.mean(x)) if len(x) else np.nan
+    if len(x) < FEW:
+        return MeanNees(len(x), mean, np.nan, np.nan, np.nan)
+    x = np.minimum(x, 1e150)
+    low = _surely_above(x, level)
     degrees = np.array([n])
     if few_carry(Squares.of(x[None]), degrees)[0]:
-        return UNDECIDED
-    (low,), (high,) = rms_interval(x[:, None], level=level)
-    if low > 1:
-        return OVERCONFIDENT
-    # An end that is NaN proves nothing.
-    if not high < 1:
-        return CONSISTENT
+        return MeanNees(len(x), mean, low, np.nan, np.nan)
+    # Of numbers in the place of squares, the ends are roots.
+    (lower,), (upper,) = rms_interval(x[:, None], level=level)
     (rare,) = unseen(x[None], degrees, level=level)
-    surely_below = high**2 + rare * (UNSEEN_NEES - 1) < 1
-    return TOO_CAUTIOUS if surely_below else UNDECIDED
+    high = float(upper**2)
+    with_unseen = float(high + rare * (UNSEEN_NEES - 1))
+    return MeanNees(len(x), mean, max(low, float(lower**2)), high, with_unseen)
+
+
+def verdict(nees: Array, n: int, level: float = LEVEL) -> Verdict:
+    """Words the value of an estimator's own covariance; see `mean_nees`."""
+    return mean_nees(nees, n, level).verdict
+
+
+def _surely_above(x: Array, level: float) -> float:
+    """Computes the largest number that the mean of nonnegative numbers (trials,) exceeds by bets;
+    0 if they are 0."""
+    middle = np.log(np.mean(x)) if x.any() else -np.inf
+    if not np.isfinite(middle):
+        return 0.0
+
+    def is_exceeded(logarithm: float) -> bool:
+        return _evidence_above_1(x / np.exp(logarithm)) >= 2 / (1 - level)
+
+    return float(np.exp(first_that(is_exceeded, middle, middle - _FARTHEST)))
 
 
 def _evidence_above_1(x: Array) -> float:
@@ -446,12 +491,13 @@ def quantile(values: Array, q: float) -> float:
 
 
 def quantiles(values: Array, q: Array) -> Array:
-    """Computes many such quantiles (k,) of one or more numbers from one sort."""
-    ordered = np.sort(finite_or(np.inf, values))
+    """Computes many such quantiles (k, ...) along the first axis (trials, ...) from one sort."""
+    ordered = np.sort(finite_or(np.inf, values), axis=0)
     position = (len(values) - 1) * q
     below = np.floor(position)
     a = ordered[below.astype(int)]
     b = ordered[np.ceil(position).astype(int)]
+    beyond = (position - below).reshape(-1, *[1] * (values.ndim - 1))
     with np.errstate(invalid="ignore"):
-        between = a + (b - a) * (position - below)
+        between = a + (b - a) * beyond
     return np.where(a < b, between, a)

@@ -15,11 +15,11 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 from ipe_bench.states.copies import SURE
 from ipe_bench.statistics import formulas as f
-from ipe_bench.statistics.intervals import clopper_pearson, mean_limits
+from ipe_bench.statistics.intervals import clopper_pearson, mean_limits, quantile, quantiles
 from ipe_bench.statistics.sample import NIS, Sample
-from ipe_bench.statistics.statistic import Statistic
+from ipe_bench.statistics.statistic import ALL, Statistic
 from ipe_bench.statistics.verdicts import NO_VERDICT, WRONG
-from ipe_bench.trials.thresholds import FIT_LEVEL, GATE
+from ipe_bench.trials.thresholds import FEW, FIT_LEVEL, GATE
 
 if TYPE_CHECKING:
     from ipe_bench.runs.results import StoredCell
@@ -66,6 +66,15 @@ rmse = of_path(f.rmse)
 bound = of_path(lambda s: s.linear_bound)
 
 
+def error_quantile(s: Sample, q: float) -> Array:
+    """Computes a quantile over all trials of the root mean square error over all epochs, of each
+    state, and of all states over the filter that is linearised at the true path (n + 1,)."""
+    if "path_error" not in s.scalars:
+        return np.full(s.n + 1, np.nan)
+    each = [quantile(e, q) for e in path(s).error.T]
+    return np.append(each * s.sizes, quantile(s.scalars["path_error"], q))
+
+
 def rmse_limits(s: Sample) -> f.Ends:
     """Computes ends (n + 1,) of the intervals of these root mean squares."""
     if not is_track(s):
@@ -94,7 +103,7 @@ def path_success(s: Sample) -> tuple[float, float, float]:
 def path_verdict(s: Sample) -> str:
     if not is_track(s):
         return NO_VERDICT
-    return f.verdict_on(s.scalars["path_nees"], s.n, s)
+    return f.mean_nees_of(s.scalars["path_nees"], s.n, s).verdict
 
 
 def nis_verdict(s: Sample) -> str:
@@ -108,7 +117,7 @@ def nis_verdict(s: Sample) -> str:
     if surely_wrong > _TOLERATED:
         return WRONG
     m = int(s.group.footer["readings"])
-    return f.verdict_on(m * s.scalars[NIS], m, s)
+    return f.mean_nees_of(m * s.scalars[NIS], m, s).verdict
 
 
 def _white_p(s: Sample) -> Array:
@@ -129,38 +138,56 @@ def not_white(s: Sample) -> tuple[float, float, float]:
 
 
 def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
-    """Computes time, root mean square error, bounds, and NEES with its limits, per epoch and state
-    of a track."""
+    """Computes time, median error and worst tenth over all trials, bounds, and NEES with its
+    limits, per epoch and state of a track, and of all states together over the filter's bound."""
     times = np.array(s.group.footer.get("times", ()), dtype=float)
-    if not len(times):
-        return
     K = len(times)
     n = s.n
-    # Of each epoch: n squared errors, NEES, NIS, its readings, n variances of the bound, trials.
-    columns = 2 * n + 4
-    own = sum(_sums(s, s.group.cells, K, columns), np.zeros((K, columns)))
-    errors = own[:, :n]
-    nees = own[:, n]
-    total = own[:, n + 3 : -1]
-    count = own[:, -1]
-    posterior = _posterior(s, K)
+    errors = _errors(s, K)
+    # Of each epoch: NEES and the trials that claim it; n variances of the bound, their ratio to
+    # those of the filter, and the trials.
+    own = sum(_sums(s, s.group.cells, K, n + 4), np.zeros((K, n + 4)))
+    if not (K and len(errors)):
+        return
+    median, worst = quantiles(errors, np.array([0.5, 0.9]))
+    nees = own[:, 0]
+    claims = own[:, 1]
     with np.errstate(all="ignore"):
-        low, high = mean_limits(n, int(count[0]))
-        for i, name in enumerate(s.names):
-            size = s.sizes[i]
-            yield {
-                "parameter": name,
-                "unit": s.parameters[i]["unit"],
-                "at": times,
-                "rmse": size * np.sqrt(errors[:, i] / count),
-                "bound": size * np.sqrt(total[:, i] / count),
-                "smooths": bool(s.group.footer.get("smooths")),
-                "posterior": size * np.sqrt(posterior[:, i]),
-                "posterior_smoothed": size * np.sqrt(posterior[:, n + i]),
-                "nees": nees / count / n,
-                "nees_low_if_honest": low,
-                "nees_high_if_honest": high,
-            }
+        bound = np.sqrt(own[:, 2:-1] / own[:, -1:])
+    posterior = np.sqrt(_posterior(s, K))
+    low, high = mean_limits(n, int(claims[0]))
+    names = [*s.names, ALL]
+    sizes = [*s.sizes, 1.0]
+    units = [*(p["unit"] for p in s.parameters), ""]
+    for i, name in enumerate(names):
+        # No posterior bound is of all states together.
+        filtered, smoothed = np.full((2, K), np.nan) if name == ALL else posterior[:, [i, n + i]].T
+        yield {
+            "parameter": name,
+            "unit": units[i],
+            "at": times,
+            "median": sizes[i] * median[:, i],
+            "q90": sizes[i] * worst[:, i],
+            "bound": sizes[i] * bound[:, i],
+            "smooths": bool(s.group.footer.get("smooths")),
+            "posterior": sizes[i] * filtered,
+            "posterior_smoothed": sizes[i] * smoothed,
+            "nees_solved": np.where(claims >= FEW, nees / np.maximum(claims, 1) / n, np.nan),
+            "nees_low_if_honest": low,
+            "nees_high_if_honest": high,
+            "trials": len(errors),
+            "claims": int(claims[0]),
+        }
+
+
+def _errors(s: Sample, epochs: int) -> Array:
+    """Reads the errors (trials, K, n + 1) of the first trials at each epoch; none if a version
+    stored them that did not keep them."""
+    from ipe_bench.trials.paths import errors_in
+
+    stored = [s.collection.load(cell, (), ("curves_errors",)) for cell in s.group.cells]
+    texts = [one["curves_errors"] for one in stored if "curves_errors" in one]
+    return errors_in(np.concatenate([*texts, np.empty(0)]), epochs, s.n + 1)
 
 
 def _posterior(s: Sample, epochs: int) -> Array:
@@ -185,8 +212,28 @@ def _sums(s: Sample, cells: Sequence[StoredCell], epochs: int, columns: int) -> 
 
 STATISTICS: tuple[Statistic, ...] = (
     Statistic(
-        "path_rmse",
-        "rmse, all epochs",
+        "path_error_median",
+        "median error, all epochs",
+        "all trials of trackers",
+        "Median of a trial's root mean square error over all epochs. Of all states together, over"
+        " the filter that is linearised at the true path, for smoothers too, so that all trackers"
+        " are compared. A track that is not finite counts as infinite.",
+        lambda s: error_quantile(s, 0.5),
+        kind="physical",
+        where=("tracks",),
+    ),
+    Statistic(
+        "path_error_q95",
+        "95 % error, all epochs",
+        "all trials of trackers",
+        "95 % quantile of these errors.",
+        lambda s: error_quantile(s, 0.95),
+        kind="physical",
+        where=("tracks",),
+    ),
+    Statistic(
+        "path_rmse_solved",
+        "rmse, solved",
         "solved trials of trackers",
         "Root mean square error over all epochs; over all states, root mean square of its ratio to"
         " the bound at the truth. Interval: as for rmse, over trials.",
@@ -220,12 +267,13 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("tracks",),
     ),
     Statistic(
-        "path_nees",
+        "path_nees_solved",
         "mean NEES / n, all epochs",
         "solved trials of trackers",
         "Mean over trials and all epochs of e' P⁻¹ e / n with the covariance P that the tracker"
         " reports: 1 where it is right; none where P is singular by the model.",
         lambda s: mean_score(s, "path_nees") / s.n,
+        given="solved",
         where=("tracks",),
     ),
     Statistic(

@@ -51,6 +51,18 @@ def family_of(footer: Mapping[str, Any]) -> str:
     return "IPE" if footer.get("equation") == "frozen" else "least squares"
 
 
+def given_of(footer: Mapping[str, Any]) -> str:
+    """Returns what an estimator was given, in a word or two."""
+    if "times" in footer:
+        return "all readings" if footer.get("smooths") else "so far"
+    return "prior" if footer["bound"] == "bayes" else "readings"
+
+
+_CLAIMS = (
+    "converged trials with a reported covariance: a trial that the estimator itself gives up on"
+    " makes no claim"
+)
+
 STATISTICS: tuple[Statistic, ...] = (
     Statistic(
         "trials", "trials", "all trials", "Their number.", len, kind="count", where=("all_trials",)
@@ -156,7 +168,7 @@ STATISTICS: tuple[Statistic, ...] = (
     ),
     _all(
         "nees_median",
-        "NEES",
+        "NEES, median",
         "Median of e' P⁻¹ e with the covariance P that the estimator reports, over the median of"
         " chi-square with n degrees: 1 if the covariance is right. A value that is not finite"
         " counts as infinite. Limits: 95 % of medians over this number of trials lie between them"
@@ -164,8 +176,21 @@ STATISTICS: tuple[Statistic, ...] = (
         f.nees_median,
         limits=f.nees_median_limits,
         where=("calibration",),
-        limits_titles={"calibration": "NEES limits"},
+        limits_titles={"calibration": "limits of the median"},
         limits_given="_if_honest",
+    ),
+    Statistic(
+        "nees_mean",
+        "NEES",
+        _CLAIMS,
+        "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 if it is right."
+        " The interval, by bets and by the studentised bootstrap, has 95 % for all estimators and"
+        " error scales of a setting together; its upper end is the largest factor of the variance"
+        " that these trials do not exclude. The verdict is read from it.",
+        lambda s: f.claimed(s).mean,
+        limits=lambda s: (f.claimed(s).low, f.claimed(s).high),
+        where=("calibration",),
+        limits_titles={"calibration": "interval of NEES"},
     ),
     _all(
         "solved_trials",
@@ -211,6 +236,16 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("solved_trials", "covariances"),
     ),
     Statistic(
+        "given",
+        "given",
+        "no trials: the same for all",
+        "What the estimator was given: of constants, all readings (readings) and also the prior of"
+        " the truth (prior); of states that move, for the state at an epoch, the readings up to it"
+        " (so far) or of the whole path (all readings).",
+        lambda s: given_of(s.group.footer),
+        kind="word",
+    ),
+    Statistic(
         "false_root_distance",
         "false root at",
         "converged trials that are not solved",
@@ -220,7 +255,7 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("covariances",),
     ),
     _solved(
-        "bias",
+        "bias_solved",
         "bias",
         "Mean error.",
         f.of_each(lambda s: f.mean(s.error, s.solved)),
@@ -228,7 +263,7 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("parameters", "theory"),
     ),
     _solved(
-        "std",
+        "std_solved",
         "std",
         "Standard deviation of the error (n - 1).",
         f.of_each(f.std),
@@ -236,16 +271,16 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("parameters",),
     ),
     _solved(
-        "rmse",
+        "rmse_solved",
         "rmse",
         "Root mean square error. Interval: 95 %, by the studentised bootstrap of its logarithm"
         " over trials (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12),"
         f" {intervals.RESAMPLES} resamples, the same for every estimator; above"
         f" {intervals.LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None for"
-        f" fewer than {FEW} trials. No upper end where larger errors may be unseen (rmse_unseen"
-        " above 0), and where a few trials carry the sum of squares: where its effective number of"
-        " trials, (Σ e²)² / Σ e⁴ (Kish, Survey Sampling, 1965), is less than for normal errors in"
-        f" all but {100 * intervals.HEAVY:g} % of cases.",
+        f" fewer than {FEW} trials. No upper end where larger errors may be unseen"
+        " (rmse_solved_unseen above 0), and where a few trials carry the sum of squares: where its"
+        " effective number of trials, (Σ e²)² / Σ e⁴ (Kish, Survey Sampling, 1965), is less than"
+        f" for normal errors in all but {100 * intervals.HEAVY:g} % of cases.",
         f.of_each(f.rmse),
         limits=f.ends_in_units(f.rmse_ends),
         kind="physical",
@@ -253,7 +288,7 @@ STATISTICS: tuple[Statistic, ...] = (
         limits_titles={"parameters": "95 % of rmse", "theory": "95 % of rmse"},
     ),
     _solved(
-        "rmse_unseen",
+        "rmse_solved_unseen",
         "unseen",
         "Share of trials that may have larger errors than those seen: the upper limit (95 %,"
         f" Clopper and Pearson) of the share of errors that {intervals.UNUSUAL:g} of normal ones"
@@ -389,13 +424,13 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("covariances",),
     ),
     _solved(
-        "rmse_over_linear_bound",
+        "rmse_solved_over_linear_bound",
         "rmse / bound",
         "Root mean square error over the linear bound.",
         lambda s: f.ratio(f.in_units(f.rmse(s), s), np.append(s.linear_bound * s.sizes, 1.0)),
     ),
     _solved(
-        "efficiency",
+        "efficiency_solved",
         "efficiency, solved",
         "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the"
         " one at the truth, Cramér and Rao's or, for estimators that use a prior, the Bayesian"
@@ -443,7 +478,7 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("parameters",),
     ),
     _solved(
-        "nees",
+        "nees_solved",
         "mean NEES / n, solved",
         "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 if it is right."
         " For a parameter it is the mean of the squared error over the reported variance. Limits:"
@@ -469,15 +504,14 @@ STATISTICS: tuple[Statistic, ...] = (
     Statistic(
         "verdict",
         "verdict",
-        "converged trials with a reported covariance: a trial that the estimator itself gives up"
-        " on makes no claim",
-        "Whether the reported covariance is right. Overconfident, too cautious: the mean NEES lies"
-        " significantly (95 % for all estimators and error scales of a setting together, for"
-        " errors of any law) above or below n, and below it also with a NEES of"
+        _CLAIMS,
+        "Whether the reported covariance is right, by the interval of the mean NEES."
+        " Overconfident, too cautious: it lies above or below 1, below also with a NEES of"
         f" {intervals.UNSEEN_NEES:g} n in the number of trials that may be unusual and unseen;"
-        " consistent: neither; undecided: a few trials carry that mean, or it seems to lie below n"
-        f" and rare large errors may be missing. None for fewer than {FEW} trials.",
-        lambda s: f.verdict_on(s.scalars["nees"], s.n, s),
+        f" consistent: it includes 1 and ends at {intervals.EXCLUDED:g} at most; not refuted: it"
+        " includes 1; undecided: a few trials carry the mean, or it seems to lie below 1 and rare"
+        f" large errors may be missing. None for fewer than {FEW} trials.",
+        lambda s: f.claimed(s).verdict,
         kind="word",
         where=("calibration",),
     ),
@@ -486,7 +520,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "claims",
         "Number of trials that converged and report a covariance, over which calibration is"
         " computed.",
-        lambda s: int((s.converged & ~np.isnan(s.scalars["nees"])).sum()),
+        lambda s: f.claimed(s).claims,
         kind="count",
         where=("calibration",),
     ),
@@ -609,10 +643,11 @@ MAIN = (
         "error_median",
         "error_q95",
         "efficiency_capped",
-        "rmse",
+        "rmse_solved",
     ),
     *(
-        "nees_median",
+        "claims",
+        "nees_mean",
         "coverage95",
         "verdict",
         "iterations_median",
@@ -622,10 +657,14 @@ MAIN = (
     "time_mean_s",
 )
 """The statistics of estimators of constants that `summary.csv` has, with their intervals."""
-NOT_MAIN = ("rmse_high",)
+NOT_MAIN = ("rmse_solved_high",)
 """Ends of intervals that it leaves out: in fewer than a thousand trials this one is hardly ever
 known."""
-MAIN_OF_STATES = (*MAIN, "path_rmse", "path_bound", "path_nees", "path_verdict", "nis_verdict")
+MAIN_OF_STATES = (
+    *MAIN,
+    *("path_error_median", "path_error_q95", "path_rmse_solved", "path_bound"),
+    *("path_nees_solved", "path_verdict", "nis_verdict"),
+)
 """Those of trackers of states that move."""
 
 SCORES: tuple[Statistic, ...] = (

@@ -37,7 +37,10 @@ SCALARS = (
     "nees",
     "crlb_distance",
 )
-PATH = ("path_nees", "path_success", "white_p", "log_likelihood", "first_bad_epoch", "copy_p")
+PATH = (
+    *("path_nees", "path_error", "path_success"),
+    *("white_p", "log_likelihood", "first_bad_epoch", "copy_p"),
+)
 """Scores of a tracker over the whole path."""
 OPTIONAL_COLUMNS = ("message", FIT, NIS, AMBIGUOUS, "root_distance", *PATH)
 """Columns that not every version or estimator stores."""

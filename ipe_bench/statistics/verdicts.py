@@ -11,12 +11,15 @@ from typing import Final, Literal
 
 from ipe_bench.trials.thresholds import FEW, FIT_LEVEL
 
-Verdict = Literal["overconfident", "too cautious", "consistent", "undecided", "wrong", "-"]
+Verdict = Literal[
+    "overconfident", "too cautious", "consistent", "not refuted", "undecided", "wrong", "-"
+]
 """Values of a verdict on a covariance."""
 
 OVERCONFIDENT: Final = "overconfident"
 TOO_CAUTIOUS: Final = "too cautious"
 CONSISTENT: Final = "consistent"
+NOT_REFUTED: Final = "not refuted"
 UNDECIDED: Final = "undecided"
 WRONG: Final = "wrong"
 NO_VERDICT: Final = "-"
@@ -59,7 +62,15 @@ VERDICTS = (
         CONSISTENT,
         "consistent",
         "=",
-        "There is no evidence against the reported covariance.",
+        "There is no evidence against the reported covariance, and the interval (95 %) of the mean"
+        " NEES excludes that the true variance is 1.5 times the reported one.",
+    ),
+    Word(
+        NOT_REFUTED,
+        "not refuted",
+        "~",
+        "There is no evidence against the reported covariance, but these trials do not exclude that"
+        " the true variance is 1.5 times the reported one.",
     ),
     Word(
         UNDECIDED,

@@ -43,6 +43,8 @@ from ipe_bench.trials.whiteness import white_p
 
 _PARTS = 10
 """Groups of paths by whose scatter the standard error of the posterior bound is known."""
+MOST_TRIALS = 10_000
+"""Trials whose errors are stored for each epoch: the first ones."""
 _INDEFINITE = 1e-10
 """A covariance of which an eigenvalue is below this, in its own deviations, has no inverse."""
 
@@ -241,8 +243,7 @@ class PathBlock:
         distance = np.where(finished, self._distance(e[:, -1]), np.nan)
         # Squared errors over the bound's variances, where the model leaves any.
         normalised = np.sum(np.where(variances > 0, e**2 / variances, 0.0), axis=2)
-        of_filter = [a[:, :, None] for a in (each, tracks.nis, tracks.degrees)]
-        sums = [a[converged].sum(axis=0) for a in (e**2, *of_filter, variances)]
+        over_filter = _over(e**2, self.variances)
         columns = {
             "trial": np.arange(self.start, self.start + len(self)),
             **by_parameter("error", self.names, e[:, -1]),
@@ -261,15 +262,38 @@ class PathBlock:
             "success": distance <= gate(n),
             "fit_p": self._fit_p(tracks),
             "path_nees": each.mean(axis=1),
+            "path_error": np.sqrt(over_filter.mean(axis=1)),
             "path_success": finished & (normalised.mean(axis=1) <= gate(n)),
             **_innovation_columns(tracks),
             "first_bad_epoch": _first_epoch(~(normalised <= gate(n))),
-            "curves": packed(trials, [*sums, np.full((K, 1), converged.sum())]),
+            "curves": packed(trials, self._sums(each[converged], variances)),
+            "curves_errors": self._errors(e, over_filter),
         }
         if tracks.stage is not None:
             columns["extra_stage"] = np.asarray(tracks.stage, dtype=float)
         columns[COLUMN] = first_tracks(self.start, tracks.mean[..., at], P, self.names)
         return estimates, columns | self._copies(tracks)
+
+    def _sums(self, claims: Array, variances: Array) -> list[Array]:
+        """Sums (K, 1 or n) over trials, by epoch: NEES of the `claims` (converged, K) and their
+        number, the variances of the bound, their ratio to those of the filter, and its number."""
+        K = claims.shape[1]
+        known = variances[np.isfinite(variances).all(axis=(1, 2))]
+        of_filter = self.variances[np.isfinite(variances).all(axis=(1, 2))]
+        ratio = _over(known, of_filter).sum(axis=0)
+        counts = [np.full((K, 1), len(trials)) for trials in (claims, known)]
+        nees_sum = claims.sum(axis=0)
+        return [nees_sum[:, None], counts[0], known.sum(axis=0), ratio[:, None], counts[1]]
+
+    def _errors(self, e: Array, over_filter: Array) -> Array:
+        """Texts (trials,) with the errors (K, n + 1) of each trial by epoch: of each state, and of
+        all over the filter's bound; empty without readings, and from `MOST_TRIALS` on."""
+        errors = np.concatenate([np.abs(e), np.sqrt(over_filter)[:, :, None]], axis=2)
+        texts = np.full(len(e), "", dtype=object)
+        numbers = self.start + np.arange(len(e))
+        for i in np.flatnonzero(finite(self.paths.x) & (numbers < MOST_TRIALS)).tolist():
+            texts[i] = base64.b64encode(errors[i].astype("<f4").tobytes()).decode()
+        return texts
 
     def _distance(self, e: Array) -> Array:
         """Squared errors (trials,) of the last epoch in the metric of the bound at the truth."""
@@ -338,6 +362,13 @@ class PathBlock:
         squares = tracks.nis.sum(axis=1)
         read = tracks.degrees.sum(axis=1)
         return np.where(read > 0, chdtrc(read, squares), np.nan)
+
+
+def _over(squares: Array, variances: Array) -> Array:
+    """Mean squares over states (trials, K) of squares (trials, K, n) over variances, of the states
+    that the model leaves any variance."""
+    ratios = np.where(variances > 0, squares / variances, 0.0)
+    return ratios.sum(axis=2) / np.maximum((variances > 0).sum(axis=2), 1)
 
 
 def _first_epoch(bad: Mask) -> Array:
@@ -432,3 +463,9 @@ def unpacked(texts: Array, epochs: int, columns: int) -> Array:
     found = [np.frombuffer(base64.b64decode(text), "<f8") for text in texts if text]
     kept = [numbers for numbers in found if len(numbers) == epochs * columns]
     return np.array(kept).reshape(len(kept), epochs, columns)
+
+
+def errors_in(texts: Array, epochs: int, columns: int) -> Array:
+    """The errors (trials, K, columns) that texts hold."""
+    found = [np.frombuffer(base64.b64decode(text), "<f4") for text in texts if text]
+    return np.array(found, dtype=float).reshape(len(found), epochs, columns)

@@ -34,14 +34,14 @@ def test_a_summary_shows_the_table_of_the_terminal_and_is_a_frame(table):
     total = table[table["parameter"] == "all"].set_index("estimator", drop=False)
     for shown in (repr(table), re.sub("<[^>]*>", " ", table._repr_html_())):
         assert "polynomial, gaussian: 20 trials per row" in shown
-        assert re.search(r"newton\s+100 \(83-100\)", shown)
-        assert f"{total['nees_median']['newton']:.2f}" in shown
+        assert re.search(r"newton\s+readings\s+100 \(83-100\)", shown)
+        assert f"{total['nees_mean']['newton']:.2f}" in shown
     # What has not all its columns is shown by pandas.
-    part = table[["estimator", "rmse"]]
+    part = table[["estimator", "rmse_solved"]]
     assert repr(part) == repr(pd.DataFrame(part))
     assert part._repr_html_() == pd.DataFrame(part)._repr_html_()
     assert "linear" not in repr(
-        table.query("estimator == 'newton'").sort_values("rmse").assign(mine=1.0)
+        table.query("estimator == 'newton'").sort_values("rmse_solved").assign(mine=1.0)
     )
     for again in (
         table.copy(),
@@ -144,7 +144,7 @@ def test_a_seed_draws_the_trials_of_a_scenario_with_that_seed(table):
     own = ib.run(dataclasses.replace(BENCH, seed=3), ESTIMATORS, 20)
     numbers = [c for c in table if "time" not in str(c)]
     pd.testing.assert_frame_equal(pd.DataFrame(other[numbers]), pd.DataFrame(own[numbers]))
-    assert not other["rmse"].equals(table["rmse"])
+    assert not other["rmse_solved"].equals(table["rmse_solved"])
     with pytest.raises(ib.UserError, match="seed"):
         ib.run(BENCH, ESTIMATORS, 20, seed=-1)
 

@@ -81,16 +81,16 @@ def test_the_root_mean_square_is_known_as_well_as_is_asked(tmp_path):
         BENCH, {"newton": ib.solvers.Newton()}, precision={"rmse": 0.06}, output=tmp_path
     )
     row = table[table["parameter"] == "all"].iloc[0]
-    assert row["rmse_low"] < row["rmse"]
+    assert row["rmse_solved_low"] < row["rmse_solved"]
     # No trial shows what an error of one in some hundred may be, and the run says so.
-    assert np.isnan(row["rmse_high"])
+    assert np.isnan(row["rmse_solved_high"])
     ((reached, unless),) = re.findall(
         r"± ([\d.]+) %, unless errors are larger in 1 of (\d+) trials or fewer",
         stop_of(table)["widest"],
     )
     # The limits of any number of looks are wider than those of one.
-    assert 100 * (1 - row["rmse_low"] / row["rmse"]) < float(reached) <= 6.0
-    assert int(unless) == round(1 / row["rmse_unseen"])
+    assert 100 * (1 - row["rmse_solved_low"] / row["rmse_solved"]) < float(reached) <= 6.0
+    assert int(unless) == round(1 / row["rmse_solved_unseen"])
     assert row["trials"] / 5 < int(unless) < row["trials"] / 2
 
 

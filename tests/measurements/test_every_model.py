@@ -63,8 +63,8 @@ def test_efficient_estimators_reach_the_bound(experiment):
     for label, estimator in estimators.items():
         row = rows.loc[label]
         bound = row["bayes_bound"] if "prior" in estimator.needs else row["crlb"]
-        low = row["rmse"] - wider * (row["rmse"] - row["rmse_low"])
-        high = row["rmse"] * (1 + wider * (row["rmse"] / row["rmse_low"] - 1))
+        low = row["rmse_solved"] - wider * (row["rmse_solved"] - row["rmse_solved_low"])
+        high = row["rmse_solved"] * (1 + wider * (row["rmse_solved"] / row["rmse_solved_low"] - 1))
         efficient = estimator.equation in EFFICIENT
         if efficient and not (row["converged"] == 1 and low <= bound <= high):
             failed[label] = (

@@ -194,7 +194,7 @@ def test_the_digits_of_certified_answers_are_the_stored_ones():
 def test_the_errors_under_a_wrong_model_are_the_stored_ones():
     every = totals(read(pages.STORED / f"mismatch{SUFFIX}"))
     known = every[every["estimator"] == "gauss_newton"]
-    columns = ["rmse_over_linear_bound", "predicted_rmse", "nees", "misfit"]
+    columns = ["rmse_solved_over_linear_bound", "predicted_rmse", "nees_solved", "misfit"]
     stored = known.sort_values("predicted_rmse")[columns].to_numpy().tolist()
     shown = [
         [float(cell.removesuffix(" %")) for cell in cells]

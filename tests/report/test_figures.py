@@ -172,7 +172,7 @@ def test_points_are_in_view_however_heavy_the_tails(synthetic):
     view = only_view(synthetic)
     panel = drawn(parameters, view)["parameter_errors_linear_lse"].figure.axes[-1]
     low, high = panel.get_ylim()
-    values = view.totals.query("estimator == 'linear_lse'")["rmse"].to_numpy()
+    values = view.totals.query("estimator == 'linear_lse'")["rmse_solved"].to_numpy()
     assert low < values.min() < values.max() < high
     synthetic.add(synthetic.scenario(error_scale=100.0), "exact", np.full((60, 3), 1e-12))
     synthetic.add(synthetic.scenario(error_scale=100.0), "lost", np.full((60, 3), 1e12))
@@ -421,10 +421,8 @@ def parted():
             row = {"estimator": label, "parameter": ALL, "error_scale": scale, "success": share}
             row |= {"success_low": 0.9 * share, "success_high": 0.1 + 0.9 * share}
             row |= {"error_median": 1e6 if lost else 1.0, "error_q95": 1e6 if lost else 1.4}
-            row |= {"nees_median": 20.0 if lost else 1.0, "trials": 60, "solved": 1.0}
-            rows.append(
-                {**row, "nees_median_low_if_honest": 0.9, "nees_median_high_if_honest": 1.1}
-            )
+            row |= {"nees_mean": 20.0 if lost else 1.0, "trials": 60, "claims": 60, "solved": 1.0}
+            rows.append({**row, "nees_mean_low": 0.9, "nees_mean_high": 1.1})
     summary = pd.DataFrame(rows)
     look = looks(list(summary["estimator"].unique()))
     focus, winner = focus_of(summary)
@@ -559,34 +557,30 @@ def test_places_of_labels_are_the_nearest_that_keep_their_distance():
     np.testing.assert_allclose(common.spread([1.0, 1.0], 0.1, 0.0, 1.0), [0.9, 1.0])
 
 
-def test_errors_of_tracks_are_over_all_epochs_each_state_over_the_bound_of_filters():
-    """At the last epoch the smoother is its filter; over all epochs one of its two states has half
-    the error."""
+def test_errors_of_tracks_are_over_all_epochs_and_all_trials():
+    """At the last epoch the smoother is its filter; over all epochs it has half the error."""
     rows = []
-    for label, errors_of in (("ukf", (2.0, 3.0)), ("ukf_rts", (1.0, 3.0))):
+    for label, error in (("ukf", 2.0), ("ukf_rts", 1.0)):
         for scale in (1.0, 10.0):
-            row = {"estimator": label, "error_scale": scale, "trials": 60, "solved": 1.0}
-            row |= {"success": 1.0, "success_low": 0.9, "success_high": 1.0}
-            row |= {"error_median": 7.0, "error_q95": 8.0, "nees_median": 1.0, "path_nees": 1.5}
-            row |= {"nees_median_low_if_honest": 0.9, "nees_median_high_if_honest": 1.1}
-            bound = 1.0 if label == "ukf" else 0.1
-            for state, error in zip(("x", "y"), errors_of, strict=True):
-                rows.append({**row, "parameter": state, "path_rmse": error, "path_bound": bound})
-            rows.append({**row, "parameter": ALL, "path_rmse": 99.0, "path_bound": 1.0})
+            row = {"estimator": label, "error_scale": scale, "trials": 60, "solved": 0.5}
+            row |= {"success": 1.0, "success_low": 0.9, "success_high": 1.0, "claims": 30}
+            row |= {"error_median": 7.0, "error_q95": 8.0, "nees_mean": 1.5, "parameter": ALL}
+            row |= {"path_error_median": error, "path_error_q95": 3 * error}
+            rows.append({**row, "nees_mean_low": 0.9, "nees_mean_high": 1.6})
     frames = {"summary": pd.DataFrame(rows)}
-    look, families = looks(["ukf", "ukf_rts"]), {"ukf": "filters", "ukf_rts": "smoothers"}
-    view = View("", "", frames, look, {}, families, focus=list(look), moving=True)
-    _, error, nees = drawn(errors, view)["headline"].figure.axes
+    look = looks(["ukf", "ukf_rts"])
+    view = View("", "", frames, look, {}, {}, focus=list(look), moving=True)
+    drawing = drawn(errors, view)["headline"]
+    _, error, nees = drawing.figure.axes
     shown = {
         line.get_color(): line.get_ydata() for line in error.lines if len(line.get_xdata()) == 2
     }
-    assert shown[look["ukf"].color] == pytest.approx([np.sqrt(6.5)] * 2)
-    assert shown[look["ukf_rts"].color] == pytest.approx([np.sqrt(5.0)] * 2)
+    assert shown[look["ukf"].color] == pytest.approx([2.0] * 2)
+    assert shown[look["ukf_rts"].color] == pytest.approx([1.0] * 2)
     assert 1.5 in {float(y) for line in nees.lines for y in line.get_ydata()}
-    assert [ax.get_ylabel() for ax in (error, nees)] == [
-        "rms over all epochs",
-        "mean over all epochs",
-    ]
+    assert "NEES is of converged trials, at the fewest ukf 30 of 60, ukf_rts 30 of 60." in (
+        drawing.caption
+    )
 
 
 # Certified and published answers ------------------------------------------------------------------
@@ -650,10 +644,8 @@ def swept_view(name: str, values, errors_of, **more) -> View:
             row = {name: value, "error_scale": 10.0, "estimator": label, "parameter": ALL}
             row |= {"success": 1.0, "success_low": 0.9, "success_high": 1.0, "trials": 60}
             row |= {"error_median": error, "error_q95": 2 * error, "solved": 1.0}
-            row |= {"nees_median": 1.0, "misfit": float(error > 50)}
-            rows.append(
-                {**row, "nees_median_low_if_honest": 0.9, "nees_median_high_if_honest": 1.1}
-            )
+            row |= {"nees_mean": 1.0, "claims": 60, "misfit": float(error > 50)}
+            rows.append({**row, "nees_mean_low": 0.9, "nees_mean_high": 1.1})
     summary = pd.DataFrame(rows).assign(**more)
     look = looks(["ekf", "newton", "far"])
     return View("", "", {"summary": summary}, look, {}, {}, focus=list(look))
@@ -798,7 +790,7 @@ def test_only_the_papers_setting_has_the_papers_figures(synthetic):
         for y in line.get_ydata()
     ]
     rows = view["summary"].query("estimator == 'linear_lse' and parameter in ['a', 'b']")
-    assert set(rows["rmse"]) <= set(shown)
+    assert set(rows["rmse_solved"]) <= set(shown)
 
 
 # Folders and pages --------------------------------------------------------------------------------

@@ -18,7 +18,8 @@ from ipe_bench.statistics.intervals import clopper_pearson
 SEEN = {
     "error_median": 0.98,
     "error_q95": 1.35,
-    "nees_median": 1.04,
+    "nees_mean": 1.04,
+    "claims": 100,
     "simulations_median": 21.0,
     "simulations_mean": 30.0,
     "time_mean_s": 2e-3,
@@ -127,7 +128,8 @@ def test_a_cell_says_all_that_is_known_of_it():
     assert isinstance(tile, Tile)
     assert tile.says == (
         "ekf, error scale 0.1: success 34 % of 200 trials (95 %: 27 to 41); error 0.98 × the"
-        " bound, 95 % of trials below 1.35; NEES 1.04: covariance too small; cost 21/30, 2.0 ms"
+        " bound, 95 % of trials below 1.35; NEES 1.04 of 100 converged: covariance too"
+        " small; cost 21/30, 2.0 ms"
     )
     assert f'title="{tile.says}"' in html([matrix])
 

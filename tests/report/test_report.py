@@ -71,16 +71,21 @@ def test_what_is_written_is_whole_and_the_page_stands_alone(result):
     both = pd.concat([main, parameters]).sort_values(keys, ignore_index=True)
     earlier = stored[list(main)].sort_values(keys, ignore_index=True)
     pd.testing.assert_frame_equal(both, earlier, rtol=5e-4)
-    assert {len(f"{abs(v):.12g}".replace(".", "").strip("0")) for v in main["rmse"]} <= {1, 2, 3, 4}
+    assert {len(f"{abs(v):.12g}".replace(".", "").strip("0")) for v in main["rmse_solved"]} <= {
+        1,
+        2,
+        3,
+        4,
+    }
     assert {
         "success_low",
-        "rmse_low",
-        "nees_median",
+        "rmse_solved_low",
+        "nees_mean",
         "simulations_mean",
         "verdict",
         "may_be_best",
     } < set(main)
-    assert "rmse_high" in set(stored) - set(main)
+    assert "rmse_solved_high" in set(stored) - set(main)
     assert len(list(main)) < 35
     assert {p.name for p in result.figures} >= {f"headline.{kind}" for kind in ("png", "pdf")}
     assert {p.name for p in result.tables} >= {
@@ -125,7 +130,9 @@ def test_survivors_are_shown_as_survivors(synthetic):
     analysis = analyse([synthetic.directory])
     total = analysis.summary[analysis.summary["parameter"] == "all"].set_index("estimator")
     assert np.isnan(
-        total.loc["lucky", ["rmse_low", "rmse_high", "efficiency_low"]].astype(float)
+        total.loc["lucky", ["rmse_solved_low", "rmse_solved_high", "efficiency_solved_low"]].astype(
+            float
+        )
     ).all()
     assert total.loc["lucky", "efficiency_capped"] == pytest.approx(0.2, rel=0.01)
     assert total["efficiency_capped"]["steady"] == total["efficiency_capped"]["filter"]

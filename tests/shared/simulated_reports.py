@@ -41,7 +41,7 @@ _READ = {
         "error_median",
         "error_q95",
         "efficiency_capped",
-        "nees_median",
+        *("nees_median", "nees_mean", "claims", "given"),
         "verdict",
     ),
     *("simulations_median", "simulations_mean", "time_mean_s", "path_verdict", "nis_verdict"),
@@ -49,7 +49,9 @@ _READ = {
 """Statistics that sentences, boxes and verdicts are made of; their other intervals take long and
 are left out."""
 _KEPT = [
-    s if s.name == "success" else replace(s, limits=None) for s in STATISTICS if s.name in _READ
+    s if s.name in ("success", "nees_mean") else replace(s, limits=None)
+    for s in STATISTICS
+    if s.name in _READ
 ]
 
 
@@ -310,6 +312,7 @@ def _drawn(
         scalars["white_p"] = np.where(
             rng.random(trials) < there.correlated, 1e-9, rng.random(trials)
         )
+        scalars["path_error"] = np.sqrt(distance / n)
         scalars["path_nees"] = 0.5 * (
             scalars["nees"] + there.mean_nees * rng.chisquare(10 * n, trials) / 10
         )
@@ -352,18 +355,11 @@ def _analysis(drawn: Board, collection: Any, samples: Mapping[tuple[int, str], S
 
 
 def _rows(s: Sample, may_be_the_best: bool) -> list[dict[str, Any]]:
-    """Returns rows of the summary: one per state with its error over all epochs, and one over all
-    parameters."""
+    """Returns rows of the summary: one per state, and one over all parameters."""
     head = dict(s.group.columns) | {"estimator": s.group.estimator, BEST: may_be_the_best}
     whole = head | {"parameter": "all"} | rows_of(_KEPT, s)[-1]
-    errors = np.sqrt((s.error**2).mean(axis=0))
-    return [
-        *(
-            {**whole, "parameter": name, "path_rmse": e}
-            for name, e in zip(s.names, errors, strict=True)
-        ),
-        whole,
-    ]
+    whole["path_error_median"] = float(np.median(s.scalars.get("path_error", np.nan)))
+    return [*({**whole, "parameter": name} for name in s.names), whole]
 
 
 def _shared(s: Sample) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def _share(share: float) -> str:
 
 MEASURES: dict[str, tuple[str, Callable[[float], str]]] = {
     "undetected": ("failed_silent", _share),
-    "NEES": ("nees", brief),
+    "NEES": ("nees_mean", brief),
     "cost": ("simulations_median", brief),
     "ms": ("time_mean_s", lambda seconds: brief(1000 * seconds)),
 }

@@ -104,7 +104,7 @@ def test_stale_results_are_named_and_never_mixed_in(filled, file):
     (line,) = analysis.collection.stale
     assert line.startswith("stale: one on repeated")
     assert "60 trials" in line
-    assert analysis.summary["rmse"].max() < 1e3
+    assert analysis.summary["rmse_solved"].max() < 1e3
 
 
 def test_failed_blocks_are_told_from_missing_ones(filled):
@@ -132,7 +132,7 @@ def test_the_truth_being_absent_is_a_problem_and_not_a_crash(filled):
     analysis = analyse([filled.directory])
     assert any("the truth" in line for line in analysis.collection.problems)
     assert analysis.summary["crlb"].isna().all()
-    assert analysis.summary["rmse"].notna().all()
+    assert analysis.summary["rmse_solved"].notna().all()
 
 
 def test_columns_stand_in_one_order_whichever_other_estimators_there_are(tmp_path):

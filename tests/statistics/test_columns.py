@@ -21,10 +21,13 @@ from ipe_bench.statistics.registry import summary_columns
 ELSEWHERE = {
     **dict.fromkeys(("success_anytime_low", "success_anytime_high"), "test_sequences.py"),
     **dict.fromkeys(
-        ("rmse_low", "rmse_high", "path_rmse_low", "path_rmse_high"), "test_intervals.py"
+        ("rmse_solved_low", "rmse_solved_high", "path_rmse_solved_low", "path_rmse_solved_high"),
+        "test_intervals.py",
     ),
     **dict.fromkeys(("efficiency_capped_low", "efficiency_capped_high"), "test_intervals.py"),
-    **dict.fromkeys(("verdict", "path_verdict"), "test_consistency.py"),
+    **dict.fromkeys(
+        ("verdict", "path_verdict", "nees_mean_low", "nees_mean_high"), "test_consistency.py"
+    ),
     "nis_verdict": "test_verdicts.py",
     **dict.fromkeys(
         ("calibration_p", "calibration_excursion", "calibration"), "test_calibration.py"
@@ -185,6 +188,11 @@ def of_path(t: Trials) -> np.ndarray:
     return rms(t.path_bound)
 
 
+def of_path_errors(t: Trials, q: float) -> np.ndarray:
+    each = [middle(e, q) for e in t.path.T]
+    return np.append(each * t.sizes, middle(t.path_error, q))
+
+
 def mean_of(name: str) -> Callable[[Trials], float]:
     return lambda t: np.nanmean(t.rows[name][t.solved])
 
@@ -228,19 +236,21 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
     "error_median": lambda t: middle(t.over_bound),
     "error_q95": lambda t: middle(t.over_bound, 0.95),
     "efficiency_capped": lambda t: 1 / np.sqrt(np.mean(np.fmin(t.over_bound, 5.0) ** 2)),
+    "nees_mean": lambda t: np.nanmean(t.nees[t.converged]) / t.n,
     "nees_median": lambda t: middle(t.nees) / chi2.median(t.n),
     "nees_median_low_if_honest": nees_median_limit(0.025),
     "nees_median_high_if_honest": nees_median_limit(0.975),
     "solved_trials": lambda t: np.sum(t.solved),
     "common_trials": lambda t: np.sum(t.solved & t.others),
     "equation": lambda t: t.equation,
+    "given": lambda t: "readings",
     "family": lambda t: "IPE" if t.equation == "frozen" else "least squares",
     "false_root": lambda t: np.mean(t.converged & ~t.solved),
     "false_root_distance": lambda t: middle(t.root_distance[t.converged & ~t.solved]),
-    "bias": lambda t: t.units(t.error[t.solved].mean(axis=0)),
-    "std": lambda t: t.units(t.error[t.solved].std(axis=0, ddof=1)),
-    "rmse": lambda t: t.units(rms(t.error[t.solved])),
-    "rmse_unseen": unseen,
+    "bias_solved": lambda t: t.units(t.error[t.solved].mean(axis=0)),
+    "std_solved": lambda t: t.units(t.error[t.solved].std(axis=0, ddof=1)),
+    "rmse_solved": lambda t: t.units(rms(t.error[t.solved])),
+    "rmse_solved_unseen": unseen,
     "effective_trials": lambda t: (
         t.solved_squares().sum(axis=1) ** 2 / (t.solved_squares() ** 2).sum(axis=1)
     ),
@@ -264,12 +274,14 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
             np.sqrt(t.linear**2 + rms((t.error - t.truth["linear_error"])[t.solved]) ** 2)
         ),
     ),
-    "rmse_over_linear_bound": lambda t: t.told["rmse"] / np.append(t.linear * t.sizes, 1.0),
-    "efficiency": lambda t: (
+    "rmse_solved_over_linear_bound": lambda t: (
+        t.told["rmse_solved"] / np.append(t.linear * t.sizes, 1.0)
+    ),
+    "efficiency_solved": lambda t: (
         t.units(rms(t.truth["crlb"][t.solved])) / t.units(rms(t.error[t.solved]))
     ),
-    "efficiency_low": lambda t: t.told["crlb"] / t.told["rmse_high"],
-    "efficiency_high": lambda t: t.told["crlb"] / t.told["rmse_low"],
+    "efficiency_solved_low": lambda t: t.told["crlb"] / t.told["rmse_solved_high"],
+    "efficiency_solved_high": lambda t: t.told["crlb"] / t.told["rmse_solved_low"],
     "rmse_all": lambda t: t.units(rms(np.where(np.isfinite(t.error), t.error, np.inf))),
     "efficiency_all": lambda t: t.units(rms(t.truth["crlb"])) / t.told["rmse_all"],
     "median_abs_error": lambda t: np.append(
@@ -278,11 +290,11 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
     "q95_abs_error": lambda t: np.append(
         [middle(abs(e), 0.95) for e in t.error.T] * t.sizes, middle(t.normalised, 0.95)
     ),
-    "nees": lambda t: np.append(
+    "nees_solved": lambda t: np.append(
         ((t.error / t.deviation)[t.solved] ** 2).mean(axis=0), t.nees[t.solved].mean() / t.n
     ),
-    "nees_low_if_honest": nees_limit(0.025),
-    "nees_high_if_honest": nees_limit(0.975),
+    "nees_solved_low_if_honest": nees_limit(0.025),
+    "nees_solved_high_if_honest": nees_limit(0.975),
     "coverage95": lambda t: np.append(
         (abs(t.error / t.deviation) <= norm.ppf(0.975)).mean(axis=0),
         np.mean(t.nees <= chi2.ppf(0.95, t.n)),
@@ -296,12 +308,14 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
     "simulations_median": lambda t: np.median(t.cost),
     "simulations_mean": lambda t: np.mean(t.cost),
     "time_mean_s": lambda t: np.mean(t.time_s),
-    "path_rmse": lambda t: t.units(rms(t.path[t.solved]), of_path(t)),
+    "path_error_median": lambda t: of_path_errors(t, 0.5),
+    "path_error_q95": lambda t: of_path_errors(t, 0.95),
+    "path_rmse_solved": lambda t: t.units(rms(t.path[t.solved]), of_path(t)),
     "path_bound": lambda t: t.units(of_path(t), of_path(t)),
     "path_success": lambda t: np.mean(t.path_success),
     "path_success_low": share_limit("low", held),
     "path_success_high": share_limit("high", held),
-    "path_nees": lambda t: mean_of("path_nees")(t) / t.n,
+    "path_nees_solved": lambda t: mean_of("path_nees")(t) / t.n,
     "path_nis": lambda t: np.nanmean(t.extra_nis),
     "not_white": lambda t: not_white(t)[0] / not_white(t)[1],
     "not_white_low": share_limit("low", not_white),
@@ -358,6 +372,7 @@ def drawn(folder, seed: int) -> Trials:
         "extra_nis": np.where(rng.random(N) < 0.1, np.nan, rng.chisquare(8, N) / 8),
         "root_distance": rng.exponential(size=N),
         "path_nees": np.where(rng.random(N) < 0.1, np.nan, rng.chisquare(n, N)),
+        "path_error": np.where(rng.random(N) < 0.1, np.nan, rng.exponential(size=N)),
         "path_success": rng.random(N) < 0.8,
         "white_p": np.where(rng.random(N) < 0.1, np.nan, rng.random(N) ** 2),
         "log_likelihood": rng.standard_normal(N),

@@ -38,19 +38,19 @@ def test_moments_are_those_of_the_errors_in_physical_units(synthetic):
     assert list(frame["unit"])[:3] == ["m", "m", "m"]
     b = row(frame, "one", "b")  # its size is 10 m
     n = 500 / 499
-    assert b["bias"] == pytest.approx(0.5)
-    assert b["std"] == pytest.approx(np.sqrt(n))
-    assert b["rmse"] == pytest.approx(np.sqrt(1.0 + 0.25))
+    assert b["bias_solved"] == pytest.approx(0.5)
+    assert b["std_solved"] == pytest.approx(np.sqrt(n))
+    assert b["rmse_solved"] == pytest.approx(np.sqrt(1.0 + 0.25))
     assert b["linear_bound"] == pytest.approx(1.0)
     assert b["crlb"] == pytest.approx(1.0)
-    assert b["rmse_over_linear_bound"] == pytest.approx(np.sqrt(1.25))
-    assert b["efficiency"] == pytest.approx(1 / np.sqrt(1.25))
-    assert b["nees"] == pytest.approx(1.25)
-    assert b["rmse_low"] < b["rmse"]
+    assert b["rmse_solved_over_linear_bound"] == pytest.approx(np.sqrt(1.25))
+    assert b["efficiency_solved"] == pytest.approx(1 / np.sqrt(1.25))
+    assert b["nees_solved"] == pytest.approx(1.25)
+    assert b["rmse_solved_low"] < b["rmse_solved"]
     total = row(frame, "one")
-    assert total["rmse"] == pytest.approx(np.sqrt((1 + 1.25 + 1) / 3))
-    assert total["bias"] == pytest.approx(np.sqrt(0.25 / 3))
-    assert total["nees"] == pytest.approx((1 + 1.25 + 1) / 3)
+    assert total["rmse_solved"] == pytest.approx(np.sqrt((1 + 1.25 + 1) / 3))
+    assert total["bias_solved"] == pytest.approx(np.sqrt(0.25 / 3))
+    assert total["nees_solved"] == pytest.approx((1 + 1.25 + 1) / 3)
     assert total["linear_bound"] == 1.0
     assert set(summary_columns()) <= set(frame.columns)
 
@@ -72,8 +72,8 @@ def test_shares_are_of_all_trials_and_moments_of_solved_ones(synthetic):
     assert total["false_root"] == 50 / 400
     assert total["success"] == 300 / 400
     assert (total["success_low"], total["success_high"]) == clopper_pearson(300, 400)
-    assert total["rmse"] == pytest.approx(np.sqrt(np.mean((e[solved] / 0.1) ** 2)))
-    assert total["nees"] == pytest.approx(1.0)
+    assert total["rmse_solved"] == pytest.approx(np.sqrt(np.mean((e[solved] / 0.1) ** 2)))
+    assert total["nees_solved"] == pytest.approx(1.0)
     assert total["coverage95"] == 300 / 400
     assert total["q95_abs_error"] == pytest.approx(1e7)
     a = row(summarize([synthetic.directory]), "one", "a")
@@ -92,9 +92,13 @@ def test_coverage_and_nees_of_an_estimator_that_boasts(synthetic):
     synthetic.add(synthetic.scenario(), "boaster", e, deviation=np.full(3, 0.05))
     frame = summarize([synthetic.directory])
     honest, boaster = row(frame, "honest"), row(frame, "boaster")
-    assert honest["nees_low_if_honest"] < honest["nees"] < honest["nees_high_if_honest"]
+    assert (
+        honest["nees_solved_low_if_honest"]
+        < honest["nees_solved"]
+        < honest["nees_solved_high_if_honest"]
+    )
     assert honest["coverage95"] == pytest.approx(0.95, abs=0.015)
-    assert boaster["nees"] == pytest.approx(4 * honest["nees"])
+    assert boaster["nees_solved"] == pytest.approx(4 * honest["nees_solved"])
     # P(chi-square_3 < chi2_95 / 4)
     assert_agrees(boaster["coverage95"], 0.418, atol=0.03)
     assert_agrees(row(frame, "boaster", "a")["coverage95"], 0.673, atol=0.03)
@@ -105,7 +109,9 @@ def test_an_estimator_without_covariance_has_no_nees_and_no_coverage(synthetic):
     synthetic.add(synthetic.scenario(), "mute", e, deviation=np.full(3, np.nan), nees=np.nan)
     frame = summarize([synthetic.directory])
     assert (
-        frame[["nees", "nees_low_if_honest", "nees_high_if_honest", "coverage95"]]
+        frame[
+            ["nees_solved", "nees_solved_low_if_honest", "nees_solved_high_if_honest", "coverage95"]
+        ]
         .isna()
         .all(axis=None)
     )
@@ -118,8 +124,8 @@ def test_estimators_with_a_prior_are_held_against_the_bayesian_bound(synthetic):
     # Half the deviation where the prior adds information: rewritten in the truth's file.
     rewrite_truth(synthetic, "bayes", 0.05)
     frame = summarize([synthetic.directory])
-    assert row(frame, "plain")["efficiency"] == pytest.approx(1.0)
-    assert row(frame, "bayes")["efficiency"] == pytest.approx(0.5)
+    assert row(frame, "plain")["efficiency_solved"] == pytest.approx(1.0)
+    assert row(frame, "bayes")["efficiency_solved"] == pytest.approx(0.5)
     assert row(frame, "bayes")["bayes_bound"] == pytest.approx(0.5)
 
 
@@ -177,12 +183,14 @@ def test_efficiency_is_against_the_bound_that_applies_and_not_the_linear_one(syn
     synthetic.add(synthetic.scenario(), "one", errors(300, bias=(0, 0, 0)))
     rewrite_truth(synthetic, "crlb", 0.08)
     frame = summarize([synthetic.directory])
-    np.testing.assert_allclose(frame["efficiency"], 0.8, rtol=1e-9)
+    np.testing.assert_allclose(frame["efficiency_solved"], 0.8, rtol=1e-9)
     np.testing.assert_allclose(frame["efficiency_all"], 0.8, rtol=1e-9)
-    np.testing.assert_allclose(frame["rmse_over_linear_bound"], 1.0, rtol=1e-9)
-    assert (frame["efficiency_high"] > 0.8).all()
+    np.testing.assert_allclose(frame["rmse_solved_over_linear_bound"], 1.0, rtol=1e-9)
+    assert (frame["efficiency_solved_high"] > 0.8).all()
     bound = np.where(frame["parameter"] == "all", 0.8, frame["crlb"])
-    np.testing.assert_allclose(frame["efficiency_high"], bound / frame["rmse_low"], rtol=1e-9)
+    np.testing.assert_allclose(
+        frame["efficiency_solved_high"], bound / frame["rmse_solved_low"], rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize(("solved", "known"), [(19, False), (20, True)])
@@ -190,8 +198,8 @@ def test_few_solved_trials_have_no_interval(synthetic, solved, known):
     synthetic.add(synthetic.scenario(), "one", errors(100), solved=np.arange(100) < solved)
     frame = summarize([synthetic.directory])
     assert (frame["solved_trials"] == solved).all()
-    assert (frame["rmse_low"].notna() == known).all()
-    assert frame["rmse"].notna().all()
+    assert (frame["rmse_solved_low"].notna() == known).all()
+    assert frame["rmse_solved"].notna().all()
 
 
 def test_errors_of_all_trials_let_none_off(synthetic):
@@ -204,7 +212,7 @@ def test_errors_of_all_trials_let_none_off(synthetic):
     synthetic.add(synthetic.scenario(), "gone", e, solved=np.arange(100) > 0, status=status)
     frame = summarize([synthetic.directory])
     far, gone = row(frame, "far"), row(frame, "gone")
-    assert far["rmse"] == gone["rmse"]
+    assert far["rmse_solved"] == gone["rmse_solved"]
     assert far["rmse_all"] == pytest.approx(1e4 / np.sqrt(100), rel=1e-3)
     assert gone["rmse_all"] == np.inf
     assert gone["efficiency_all"] == 0.0

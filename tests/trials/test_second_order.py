@@ -175,7 +175,7 @@ def test_summary_and_table_have_theory_for_least_squares_alone(tmp_path):
     assert rows.loc["newton", "predicted_rmse"].isna().all()
     gn = rows.loc["gn"]
     assert gn["predicted_rmse"].notna().all()
-    np.testing.assert_allclose(gn["rmse"], gn["predicted_rmse"], rtol=0.15)
+    np.testing.assert_allclose(gn["rmse_solved"], gn["predicted_rmse"], rtol=0.15)
     # Under the wrong model the bound is no longer what happens.
     mistaken = gn[gn["truth"].astype(str) != "nan"] if "truth" in gn else gn
     assert (mistaken["predicted_rmse"] > 1.05 * mistaken["crlb"]).any()

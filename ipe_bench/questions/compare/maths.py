@@ -34,7 +34,7 @@ from ipe_bench.statistics.collect import (
 from ipe_bench.statistics.comparisons import ALPHA, differences, holm
 from ipe_bench.statistics.intervals import verdict
 from ipe_bench.statistics.sample import Sample, samples
-from ipe_bench.statistics.verdicts import CONSISTENT
+from ipe_bench.statistics.verdicts import CONSISTENT, NOT_REFUTED
 from ipe_bench.trials.thresholds import gate
 
 if TYPE_CHECKING:
@@ -285,7 +285,7 @@ def _may_be_right(kind: str, first: Array, n: int) -> bool:
     """Returns whether the mean of the first may be that of a right covariance of n parameters, or
     of no bias."""
     if kind == "honesty":
-        return verdict(n * first, n) == CONSISTENT
+        return verdict(n * first, n) in (CONSISTENT, NOT_REFUTED)
     # Within two standard errors of the mean.
     return abs(first.mean()) <= 2 * first.std() / np.sqrt(len(first))
 

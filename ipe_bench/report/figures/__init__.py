@@ -26,6 +26,7 @@ FIGURES = (
     "one_track",
     "costs",
     "parameters",
+    "tracks",
     "matrix",
     "headline",
 )
@@ -49,7 +50,7 @@ NAMES = {
         " setting"
     ),
     "one_track": "one trial: truth, readings, and two tracks with their 95 % bands",
-    "tracks": "error of each state at each epoch beside its bounds, and NEES",
+    "tracks": "errors of all trials at each epoch, a panel for each tracker, and NEES",
 }
 """Names and subjects of our figures; the names of files go on with the setting."""
 INDEX = "index.json"

@@ -15,19 +15,18 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View, in_focus
-from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, REFERENCE, Look, print_width, strong
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, Look, print_width, strong
 from ipe_bench.report.words import brief, enumerate_few, value_text
-from ipe_bench.statistics.statistic import ALL
 
-CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_median": 30.0}
+CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_mean": 30.0}
 """Errors beyond are drawn here: the size of a diverged error carries no information, and the bound
 needs the room."""
-BARS = "Bars: 95 % intervals of success, and errors from the median to the 95 % quantile."
-_ALONG = (
-    "Success: share of tracks kept to the last epoch, with 95 % intervals. Hollow: some trials"
-    " have no track."
+BARS = (
+    "Bars: 95 % intervals of success and of the mean NEES, errors from the median to the 95 %"
+    " quantile."
 )
-_LIMITS = ("nees_median_low_if_honest", "nees_median_high_if_honest")
+_ALONG = " Success and NEES: at the last epoch. Error: over all epochs."
+_NEES = ("nees_mean_low", "nees_mean_high")
 _ALL = 0.995
 """Success that all estimators have where they are alike."""
 _APART = 0.1
@@ -49,7 +48,7 @@ def draw(view: View) -> Iterator[Drawing]:
     start = _parting(view, totals) if several else view.scales[0]
     scales = [scale for scale in view.scales if scale >= start]
     rows = totals[totals["error_scale"] >= start]
-    count = 3 if rows["nees_median"].notna().any() else 2
+    count = 3 if rows["nees_mean"].notna().any() else 2
     height = max(3.3, 0.17 * len(view.look) + 1.6)
     look = _looks(view) if several else view.look
     fig, axes = common.panels(count, look, height=height, scales=scales, row=count)
@@ -61,27 +60,16 @@ def draw(view: View) -> Iterator[Drawing]:
     over = "over error scales" if several else f"at error scale {value_text(start)}"
     title = f"Success, error and reported covariance {over}"
     said = _start_in_words(view, start) if start > view.scales[0] else ""
-    yield view.drawing(fig, "headline", title, said, _ALONG if view.moving else BARS)
+    told = f"{BARS}{_ALONG}" if view.moving else BARS
+    yield view.drawing(fig, "headline", title, said, told, _solved_in_words(rows))
 
 
 def over_paths(view: View) -> pd.DataFrame:
-    """Returns the totals with errors and NEES over all epochs, where a smoother is better than its
-    filter: at the last they are equal by definition. Errors of each state are over those of the
-    filter linearised at the true path."""
-    states = view["summary"][view["summary"]["parameter"] != ALL]
-    filters = [label for label in view.look if view.families.get(label) != "smoothers"]
-    place = ["error_scale", "parameter"]
-    filtered = states[states["estimator"].isin(filters)]
-    bounds = filtered.groupby(place)["path_bound"].median()
-    error = view.totals["path_rmse"]
-    if len(bounds):
-        whose = pd.MultiIndex.from_frame(states[place])
-        squares = (states["path_rmse"] / bounds.reindex(whose).to_numpy()) ** 2
-        means = squares.groupby([states["error_scale"], states["estimator"]]).mean()
-        index = pd.MultiIndex.from_frame(view.totals[["error_scale", "estimator"]])
-        error = np.sqrt(means.reindex(index).to_numpy())
-    nothing: dict[str, Any] = dict.fromkeys(("error_q95", *_LIMITS), np.nan)
-    return view.totals.assign(error_median=error, nees_median=view.totals["path_nees"], **nothing)
+    """Returns the totals with errors over all epochs, where a smoother is better than its filter:
+    at the last they are equal by definition."""
+    totals = view.totals
+    along = {name: totals[f"path_{name}"] for name in ("error_median", "error_q95")}
+    return totals.assign(**along)
 
 
 def _looks(view: View) -> dict[str, Look]:
@@ -94,15 +82,14 @@ def _looks(view: View) -> dict[str, Look]:
 
 
 def _parting(view: View, totals: pd.DataFrame) -> float:
-    """Returns the last of the scales up to which all estimators but the reference are alike, so
-    that at least three are left; the first if they never part."""
-    rows = totals[totals["estimator"] != REFERENCE]
-    whole = rows["estimator"].nunique()
+    """Returns the last of the scales up to which all estimators are alike, so that at least three
+    are left; the first if they never part."""
+    whole = totals["estimator"].nunique()
     alike = []
     for scale in view.scales:
-        here = rows[rows["error_scale"] == scale]
+        here = totals[totals["error_scale"] == scale]
         with np.errstate(all="ignore"):
-            spreads = [_spread(here[name]) for name in ("error_median", "nees_median")]
+            spreads = [_spread(here[name]) for name in ("error_median", "nees_mean")]
         # Of a statistic that no estimator has, the spread is NaN.
         close = not any(spread > 1 + _APART for spread in spreads)
         complete = len(here) == whole
@@ -119,8 +106,21 @@ def _spread(values: pd.Series[Any]) -> float:
 
 
 def _start_in_words(view: View, start: float) -> str:
-    but = f" but {REFERENCE}" if REFERENCE in view.look else ""
-    return f"Up to error scale {value_text(start)} all{but} are alike: the axis starts there."
+    return f"Up to error scale {value_text(start)} all are alike: the axis starts there."
+
+
+def _solved_in_words(rows: pd.DataFrame) -> str:
+    """Says of how many converged trials the NEES is that fewer claim than there are, at the scale
+    where fewest do."""
+    some = rows[rows["nees_mean"].notna() & (rows["claims"] < rows["trials"])]
+    if some.empty:
+        return ""
+    fewest = some.sort_values("claims", kind="stable").drop_duplicates("estimator")
+    told = [
+        f"{label} {claims:.0f} of {trials:.0f}"
+        for label, claims, trials in fewest[["estimator", "claims", "trials"]].to_numpy()
+    ]
+    return f"NEES is of converged trials, at the fewest {enumerate_few(told, 8)}."
 
 
 def draw_panels(
@@ -143,25 +143,20 @@ def draw_panels(
     words |= {"most": CEILING["error_q95"], "interval": ("error_median", "error_q95")}
     least = 0.5
     if view.moving:
-        # Errors over all epochs are of the trials that have a track.
-        words |= {"label": "rms over all epochs", "trials": "solved_trials"}
+        words["label"] = "over all epochs: median, bar to 95 %"
         least = 0.01  # smoothers are far below the filter's bound
     errors = capped[["error_median", "error_q95"]]
     common.decades(error, errors.clip(lower=least), least=4.0)
     common.bound_line(error, 1.0, best)
     common.curves(error, rows, "error_median", *shown, **words)
-    claims = rows[rows["nees_median"].notna()]
+    claims = rows[rows["nees_mean"].notna()]
     for nees in third:
-        values = capped["nees_median"].clip(lower=0.5)
-        common.decades(nees, np.append(values, 1.0), least=4.0)
+        values = capped["nees_mean"].clip(lower=0.5)
+        common.decades(nees, np.append(values, 1.0), least=4.0, ends=claims[[*_NEES]])
         common.bound_line(nees, 1.0, best)
-        low, high = (claims[name] for name in _LIMITS)
-        if low.notna().any():
-            limits = "95 % limits of the median if the covariance is right"
-            common.band(nees, low.min(), high.max(), limits)
-        mean = "mean over all epochs" if view.moving else "median"
-        words = {"heading": "NEES", "label": mean, "most": CEILING["nees_median"]}
-        common.curves(nees, claims, "nees_median", *shown, **words)
+        words = {"heading": "NEES", "label": "mean of converged", "most": CEILING["nees_mean"]}
+        words |= {"trials": "claims", "interval": _NEES}
+        common.curves(nees, claims, "nees_mean", *shown, **words)
 
 
 def draw_distributions(view: View) -> Iterator[Drawing]:

@@ -1,5 +1,4 @@
-"""Draws errors parameter by parameter: figures 2 and 3 of the paper, and those of trackers from
-epoch to epoch."""
+"""Draws errors parameter by parameter: figures 2 and 3 of the paper."""
 
 from __future__ import annotations
 
@@ -15,7 +14,6 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.style import (
     BLACK,
-    BOUND_COLOR,
     BOUND_DASH,
     COLORS,
     GREY,
@@ -23,11 +21,12 @@ from ipe_bench.report.style import (
     REFERENCE,
     Look,
 )
-from ipe_bench.report.words import brief, enumerate_few, value_text
+from ipe_bench.report.words import brief, value_text
 from ipe_bench.statistics.statistic import ALL
 
 MOST_GROUPS = 8
 """Groups of parameters that have panels."""
+_ENDS = ("rmse_solved_low", "rmse_solved_high")
 
 
 def draw(view: View) -> Iterator[Drawing]:
@@ -76,7 +75,11 @@ def _draw_group(
     if not several:
         common.name_axis(ax, list(look))
     part = rows[rows["parameter"].isin(list(look))]
-    common.decades(ax, part[["rmse", "linear_bound"]], ends=part[["rmse_low", "rmse_high"]])
+    common.decades(
+        ax,
+        part[["rmse_solved", "linear_bound"]],
+        ends=part[[*_ENDS]],
+    )
     for i, (name, one) in enumerate(look.items()):
         own = part[part["parameter"] == name].sort_values("error_scale")
         style: Any = {"color": one.color, "linestyle": BOUND_DASH, "linewidth": 1.0}
@@ -108,14 +111,14 @@ def _name_parameters(ax: Any, look: Mapping[str, Look]) -> None:
 def _draw_ratios(ax: Any, rows: pd.DataFrame, totals: pd.DataFrame, view: View) -> None:
     """Draws the errors over their linear bounds, of all parameters together and each in grey."""
     several = len(view.scales) > 1
-    ratio = rows["rmse_over_linear_bound"]
+    ratio = rows["rmse_solved_over_linear_bound"]
     if not several:
         common.name_axis(ax, [ALL])
-    values = np.append(ratio, [1.0, *totals["rmse"]])
-    common.decades(ax, values, ends=totals[["rmse_low", "rmse_high"]])
+    values = np.append(ratio, [1.0, *totals["rmse_solved"]])
+    common.decades(ax, values, ends=totals[[*_ENDS]])
     if several:
         grey = {parameter["name"]: Look(GREY, ",") for parameter in view.parameters}
-        _curves(ax, rows.assign(rmse=ratio), grey, view)
+        _curves(ax, rows.assign(rmse_solved=ratio), grey, view)
         ax.plot([], [], color=GREY, label="each parameter")
     _curves(ax, totals, {ALL: Look(BLACK, "o")}, view, "all parameters", "bounds")
     common.bound_line(ax, 1.0, "linear bound, eq. (5)")
@@ -123,7 +126,7 @@ def _draw_ratios(ax: Any, rows: pd.DataFrame, totals: pd.DataFrame, view: View) 
 
 def _together(totals: pd.DataFrame) -> str:
     """States the error of all parameters at the largest scale that has one."""
-    known = totals[["error_scale", "rmse"]].dropna()
+    known = totals[["error_scale", "rmse_solved"]].dropna()
     if known.empty:
         return ""
     scale, error = known.to_numpy()[-1]
@@ -145,7 +148,15 @@ def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[s
 def _curves(ax: Any, rows: Any, look: Any, view: View, heading: str = "", unit: str = "") -> None:
     given: Any = {"by": "parameter", "trials": "solved_trials", "heading": heading}
     given["label"] = common.text(with_unit("rms error", unit))
-    common.curves(ax, rows, "rmse", look, view.scales, interval=("rmse_low", "rmse_high"), **given)
+    common.curves(
+        ax,
+        rows,
+        "rmse_solved",
+        look,
+        view.scales,
+        interval=_ENDS,
+        **given,
+    )
 
 
 def _missing(totals: pd.DataFrame) -> str:
@@ -159,69 +170,4 @@ def _missing(totals: pd.DataFrame) -> str:
     return f"{share} at scale {value_text(float(last['error_scale']))}"
 
 
-def draw_tracks(view: View) -> Iterator[Drawing]:
-    """Draws the root mean square error of each state beside its bounds, and NEES within its limits,
-    at the largest error scale."""
-    rows = view["tracks"]
-    if rows.empty:
-        return
-    scale = rows["error_scale"].max()
-    rows = rows[rows["error_scale"] == scale]
-    look = view.with_look(rows["estimator"])
-    states = list(dict.fromkeys(rows["parameter"]))[: common.MOST_PANELS - 1]
-    fig, axes = common.panels(len(states) + 1, look)
-    for state, ax in zip(states, axes, strict=False):
-        part = rows[rows["parameter"] == state]
-        common.lines(ax, part, "at", "rmse", look, legend=False)
-        _draw_bounds(ax, part)
-        common.decades(ax, part[["rmse", "bound", "posterior", "posterior_smoothed"]])
-        common.title(ax, state)
-        error = with_unit("rms error", part["unit"].iloc[0])
-        ax.set(xlabel="time [s]", ylabel=common.text(error))
-    first = rows[rows["parameter"] == states[0]]
-    _draw_nees(axes[-1], first, look)
-    common.legend(fig, axes, look)
-    total = []
-    for name, part in first.groupby("estimator", sort=False):
-        error = np.sqrt(np.mean(part["rmse"] ** 2))
-        total.append(f"{name} {error:.3g}")
-    yield view.drawing(
-        fig,
-        "tracks",
-        f"Tracks at error scale {value_text(scale)}, converged trials",
-        "Root mean square error at each epoch, with the bound along the true path; NEES over"
-        " states.",
-        f"{states[0]} over all epochs: {enumerate_few(total, 3)}.",
-    )
-
-
-def _draw_bounds(ax: Any, rows: pd.DataFrame) -> None:
-    """Draws the bounds along the true path, then the posterior ones, which are the same for every
-    estimator."""
-    style: Any = {"color": BOUND_COLOR, "linewidth": 1.0, "zorder": 1}
-    for smooths, dash, kind in ((False, "--", "filter"), (True, (0, (5, 1)), "smoother")):
-        own = rows[rows["smooths"] == smooths]
-        if np.isfinite(own["bound"]).any():
-            one = own[own["estimator"] == own["estimator"].iloc[0]]
-            label = f"{kind} linearised at the truth"
-            ax.plot(one["at"], one["bound"], linestyle=dash, label=label, **style)
-    one = rows[rows["estimator"] == rows["estimator"].iloc[0]]
-    for name, dash, kind in (
-        ("posterior", ":", "filters"),
-        ("posterior_smoothed", "-.", "smoothers"),
-    ):
-        if np.isfinite(one[name]).any():
-            ax.plot(one["at"], one[name], dash, label=f"posterior bound of {kind}", **style)
-
-
-def _draw_nees(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:
-    """Draws NEES over all states with the limits that it keeps if covariances are right."""
-    common.lines(ax, rows, "at", "nees", look, legend=False)
-    low, high = (rows[f"nees_{end}_if_honest"].iloc[0] for end in ("low", "high"))
-    common.band(ax, low, high, "95 % limits for a right covariance")
-    common.decades(ax, rows["nees"])
-    common.title(ax, "NEES")
-    ax.set(xlabel="time [s]", ylabel="NEES / n")
-
-
-FIGURES = (Figure(draw, ("summary",)), Figure(draw_tracks, ("tracks",), main=True))
+FIGURES = (Figure(draw, ("summary",)),)

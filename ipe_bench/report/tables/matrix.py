@@ -35,10 +35,12 @@ from ipe_bench.report.words import (
 from ipe_bench.statistics.verdicts import (
     CONSISTENT,
     NO_VERDICT,
+    NOT_REFUTED,
     OVERCONFIDENT,
     TOO_CAUTIOUS,
     UNDECIDED,
 )
+from ipe_bench.trials.thresholds import FEW
 
 MATRIX = "matrix"
 """Begins the names of files of a matrix."""
@@ -47,7 +49,7 @@ SUCCESS = "success"
 VIEWS = {
     "success": ("success", "Successful trials, %"),
     "error": ("error", "Median error, relative to"),
-    "nees": ("covariance", "NEES, median: 1 is right"),
+    "nees": ("covariance", "NEES, mean: 1 is right"),
     "cost": ("cost", "Simulations of a trial, median"),
 }
 """What the cells of a page show, one view at a time: its name, and what number and colour are."""
@@ -63,6 +65,7 @@ _COVARIANCE = {
     OVERCONFIDENT: "covariance too small",
     TOO_CAUTIOUS: "covariance too large",
     CONSISTENT: "no evidence against the covariance",
+    NOT_REFUTED: "covariance not refuted",
 }
 
 
@@ -294,10 +297,11 @@ def _tile(
     # A blank in place of a sign keeps numbers below each other.
     text = f"{number}{sign or ' '}"
     paid = row["simulations_median"]
+    nees = row["nees_mean"] if row["claims"] >= FEW else math.nan
     views = {
         "success": Shown(number, step(row["success"])),
         "error": Shown(_brief(row["error_median"]), step(_nearness(row["error_median"]))),
-        "nees": Shown(_brief(row["nees_median"]), step(_nearness(row["nees_median"]))),
+        "nees": Shown(_brief(nees), step(_nearness(nees))),
         "cost": Shown(_brief(paid), step(_cheapness(paid, *costs))),
     }
     setting, scale = finding.places[at]
@@ -317,7 +321,7 @@ def _says(row: Row, verdict: str, moving: bool) -> str:
     told = (
         f"success {percent(row['success'])} of {trials:,} trials (95 %: {low} to {high})",
         f"{error}, 95 % of trials below {_brief(row['error_q95'])}",
-        f"NEES {_brief(row['nees_median'])}: {covariance}",
+        f"NEES {_brief(row['nees_mean'])} of {row['claims']} converged: {covariance}",
         f"cost {simulations}, {duration(row['time_mean_s'], 2)}",
     )
     return "; ".join(told)

@@ -26,7 +26,7 @@ from ipe_bench.statistics.statistic import ALL, Where, frame_columns
 
 _OPEN = (
     " An interval of one end (> or <) stands where larger errors may be unseen, in 3 of N trials"
-    " or fewer; rmse_unseen in summary.csv is that share."
+    " or fewer; rmse_solved_unseen in summary_all.csv is that share."
 )
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "tracks": (
@@ -34,7 +34,7 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
         "Over all epochs; all: root mean square over the states, relative to the filter linearised"
         " at the true path, or for smoothers, which use later readings too, to the smoother behind"
         f" it; about 1 is good for either.{_OPEN}",
-        lambda rows: rows["path_rmse"].notna(),
+        lambda rows: rows["path_bound"].notna(),
     ),
     "costs": (
         "Costs",

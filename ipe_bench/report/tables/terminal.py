@@ -38,7 +38,8 @@ from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import all_statistics, summary_columns
 from ipe_bench.statistics.statistic import ALL, BEST, Kind, Statistic, Where
-from ipe_bench.statistics.verdicts import VERDICTS, shown, sign_of
+from ipe_bench.statistics.verdicts import CONSISTENT, NOT_REFUTED, VERDICTS, shown, sign_of
+from ipe_bench.trials.thresholds import FEW
 
 _MOST_LINES = 46
 """Lines that a terminal shows of several settings, most of them of matrices."""
@@ -49,12 +50,15 @@ _WIDE_ENOUGH = 100
 _LEGEND = (
     "success: % of all trials (95 % interval); bold: not significantly worse than the best, unless"
     " this holds for all{failed}; error: median / 95 % quantile over {reference}; efficiency, NEES"
-    " (median): 1 is ideal{sign}; cost: simulations of a trial, median/mean if they differ; time:"
-    " mean of a trial. More: ipe-bench list statistic."
+    " (mean; in brackets the converged trials): 1 is ideal{sign}; cost: simulations of a trial,"
+    " median/mean if they differ; time: mean of a trial. More: ipe-bench list statistic."
 )
 _FAILED = "; failed: known / undetected, %"
-_SPELT_OUT = "; verdict: is the reported covariance right?"
-_SIGNS = f", {', '.join(f'{word.sign} {word.shown}' for word in VERDICTS[:4])}"
+_SPELT_OUT = (
+    "; verdict: is the reported covariance right? Within: the largest factor of the variance that"
+    " is not excluded"
+)
+_SIGNS = f", {', '.join(f'{word.sign} {word.shown}' for word in VERDICTS[:5])}"
 _TOLD = (
     "With noise=unknown every estimator here assumes R with the true levels at the nominal"
     " readings; bounds and success hold for parameters that are estimated together with the"
@@ -226,19 +230,22 @@ def overview_columns(
         return f"{brief(row['error_median'])}{slash}{brief(row['error_q95'])}"
 
     def nees(row: Mapping[str, Any]) -> str:
-        sign = sign_of(row["verdict"]) if narrow else ""
-        return f"{brief(row['nees_median'])} {sign}".strip()
+        if row["claims"] < FEW:
+            return "-"
+        sign = sign_of(row["verdict"]) if narrow else _of_claims(row)
+        return f"{brief(row['nees_mean'])} {sign}".strip()
 
     columns = [words("estimator", [row["estimator"] for row in rows], best)]
+    columns.append(words("given", [row["given"] for row in rows]))
     columns.append(numbers("success", "success", _success, best))
     if not narrow:
         columns.append(numbers("failed", "failed_silent", _failed))
     columns.append(numbers("error", "error_median", error))
     efficiency = "eff." if narrow else "efficiency"
     columns.append(numbers(efficiency, "efficiency_capped", _efficiency))
-    columns.append(numbers("NEES", "nees_median", nees))
+    columns.append(numbers("NEES", "nees_mean", nees))
     if not narrow:
-        columns.append(words("verdict", [shown(row["verdict"]) for row in rows]))
+        columns.append(words("verdict", map(_verdict, rows)))
     columns.append(numbers("cost", "simulations_median", _cost))
     columns.append(numbers("time", "time_mean_s", _time))
     return columns
@@ -247,6 +254,25 @@ def overview_columns(
 def _success(row: Mapping[str, Any]) -> str:
     ends = ends_in_percent(row["success_low"], row["success_high"])
     return f"{share_text(row['success'])} ({'-'.join(ends)})"
+
+
+def _verdict(row: Mapping[str, Any]) -> str:
+    """Words a verdict, with the largest factor of the variance that is not excluded."""
+    verdict = row["verdict"]
+    if verdict not in (CONSISTENT, NOT_REFUTED) or math.isnan(row["nees_mean_high"]):
+        return shown(verdict)
+    return f"{shown(verdict)}, within {factor(row['nees_mean_high'])}"
+
+
+def _of_claims(row: Mapping[str, Any]) -> str:
+    """Says of how many trials a mean NEES is, unless of all."""
+    return f"({row['claims']})" if row["claims"] < row["trials"] else ""
+
+
+def factor(value: float) -> str:
+    """Formats an upper end of a factor in two figures, rounded upwards."""
+    size = 10 ** (math.floor(math.log10(value)) - 1)
+    return f"{math.ceil(value / size - 1e-9) * size:.3g}"
 
 
 def _failed(row: Mapping[str, Any]) -> str:

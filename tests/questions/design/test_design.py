@@ -281,7 +281,7 @@ def test_gauss_newton_reaches_the_bound_of_the_designed_model():
             )
             rows = table[table["parameter"] != "all"]
             assert (rows["solved"] == 1).all()
-            ratio.append(rows["rmse"].to_numpy())
+            ratio.append(rows["rmse_solved"].to_numpy())
         mean = np.sqrt(np.mean((ratio[0] / ratio[1]) ** 2))
         # Eleven ratios of deviations of 400 errors each: a standard deviation of 0.05 apiece, 0.02
         # together.
