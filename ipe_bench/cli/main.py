@@ -31,7 +31,7 @@ HOMES = {
 }
 """The module of each command that is no question, which is loaded when the command is given."""
 
-SHORT = ("estimate", "design", "posterior")
+SHORT = ("run", "estimate", "design", "posterior")
 """Commands that take a model and files of readings without keys."""
 
 
@@ -144,6 +144,10 @@ def _dispatch(words: list[str]) -> int:
 
         short = shorts.read(command, rest)
         say(*short.assumed)
+        if command == "run" and short.readings:
+            from ipe_bench.cli.own import own_command
+
+            return own_command(short)
         rest = short.in_full
         if command in QUESTIONS:
             rest = short.words

@@ -51,6 +51,10 @@ COMMANDS: dict[str, tuple[str, str, str, Arguments] | None] = {
         "simulate, estimate, store and report",
         "0 done; 1 done, but something failed",
         """
+  ipe-bench run oxygen.py oxygen.csv              which estimator to take for data
+                                                  like yours: your function, a
+                                                  formula in quotes, or the YAML
+                                                  file of a state model with a log
   ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[ekf]"
   ipe-bench run +experiment=paper                 an experiment
   ipe-bench run -m error_scale=1,10,100 seed=1,2  a job for each combination

@@ -30,6 +30,7 @@ _YAML = (".yaml", ".yml")
 _FUNCTION = re.compile(r"(?P<file>.+\.py)(:(?P<name>\w*))?")
 _FORMULA = re.compile(r"[-+*/^()<>]|\bif\b")
 """A sign that a word without a key is a formula, rather than a name."""
+_FLAG = re.compile("--?[a-z][a-z-]*")
 _NAMED = re.compile(r"\s*(?P<reading>[A-Za-z_]\w*)\s*=(?!=)\s*(?P<formula>.+)", re.DOTALL)
 _START = re.compile(r"measurement\.start(?:\.(?P<name>\w+)=|=\{(?P<names>.*)\}$)")
 _MODELS = ("measurement", "state_model")
@@ -84,7 +85,7 @@ def read(command: str, words: Sequence[str]) -> Short:
 def _kind(word: str) -> str:
     """Tells a model and a file of readings from KEY=VALUE and other words."""
     bare = re.sub("[=<>!]=", "", word)
-    if "=" in bare or word.startswith(("~", "--")):
+    if "=" in bare or word.startswith("~") or _FLAG.fullmatch(word):
         return "key"
     if Path(word).suffix in _DATA:
         return "readings"

@@ -17,6 +17,14 @@ THAT_FIND = {"tracker": ("ekf", "ukf")}
 """Trackers of `find=`: a search needs a likelihood, which an estimate of the whole path does not
 have."""
 
+OF_OWN = {
+    "solver": ("auto", "newton"),
+    "baseline": ("levenberg_marquardt", "map_lm", "ekf", "ukf"),
+    "tracker": ("auto", "ekf", "ukf", "ukf_rts"),
+}
+"""What `run` compares on data like a user's own: of constants three that take no prior, one of them
+IPE, and three that do."""
+
 
 @functools.cache
 def of_run(group: str) -> tuple[str, ...]:

@@ -413,11 +413,26 @@ def widened(model: StateModel, scale: float) -> StateModel:
             "leave error_scale out"
         )
     m, P = model.prior
-    wider = Normal(m, scale**2 * P)
+    return _with_prior(model, Normal(m, scale**2 * P))
+
+
+def beginning_at(model: StateModel, start: Array) -> StateModel:
+    """Returns the model whose paths all begin at the states `start` (n,), before the first
+    transition; it draws paths, and no tracker is told so.
+
+    Raises:
+        UserError: the model's paths are stored.
+    """
+    if type(model).draw is not StateModel.draw:
+        raise UserError(f"state_model={model.name}: has stored paths, and draws none")
+    return _with_prior(model, Normal(start, np.zeros((model.n, model.n))))
+
+
+def _with_prior(model: StateModel, prior: Normal) -> StateModel:
     parts = {
         "__doc__": type(model).__doc__,
         "name": model.name,
-        "prior": property(lambda self: wider),
+        "prior": property(lambda self: prior),
     }
     other = copy.copy(model)
     object.__setattr__(other, "__class__", type(type(model).__name__, (type(model),), parts))

@@ -1,0 +1,98 @@
+"""Defines `ipe-bench run MODEL FILE`, which answers which estimator to take for data like a user's
+own."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ipe_bench.cli import say_files, show
+from ipe_bench.cli.keys import of
+from ipe_bench.cli.shorts import Short
+from ipe_bench.cli.single import Single, single
+from ipe_bench.cli.words import TRUTH
+from ipe_bench.plugins import standard
+from ipe_bench.questions.own.maths import Own
+from ipe_bench.runs.provenance import describe
+
+_TRIALS = 200
+"""Data sets that are simulated unless trials= says otherwise."""
+_LOGS = 100
+"""Logs likewise."""
+_WITHOUT_MEANING = (*of("run", "figures"), TRUTH, "find", "experiment")
+
+
+def own_command(short: Short) -> int:
+    """Simulates data like those in the files of a short form, prints which estimator to take, and
+    writes files; returns 1 if none is to be taken."""
+    choice = [f"{group}=[{','.join(names)}]" for group, names in standard.OF_OWN.items()]
+    asked = single("run", short.words, choice)
+    asked.words.refuse(_WITHOUT_MEANING, "has no meaning with a model and readings of your own")
+    if asked.spec.state_model is None:
+        found, folder = _of_constants(asked, short.readings)
+    else:
+        found, folder = _of_log(asked, short.readings)
+    from ipe_bench.questions.own.answer import own_parts, takes_one, write_own
+
+    with folder as place:
+        files = write_own(place, asked.measurement, found)
+    show(own_parts(asked.measurement, found))
+    say_files(files)
+    return 0 if takes_one(found) else 1
+
+
+def _folder(
+    asked: Single, trials: int, files: list[str], **identity: Any
+) -> AbstractContextManager[Path]:
+    from ipe_bench.questions.own.answer import NAME, TABLE
+
+    readings = [str(Path(file).resolve()) for file in files]
+    known = {"readings": readings, "trials": trials, "seed": asked.spec.seed, **identity}
+    return asked.folder(NAME, known, (TABLE,))
+
+
+def _described(estimators: Any) -> dict[str, Any]:
+    return {label: describe(one) for label, one in estimators.items()}
+
+
+def _of_constants(asked: Single, files: list[str]) -> tuple[Own, AbstractContextManager[Path]]:
+    from ipe_bench.questions.own.maths import own
+
+    spec = asked.spec
+    trials = spec.trials or _TRIALS
+    answers = standard.constructed({"solver": ("auto",)})
+    fitting = replace(spec, readings=tuple(files), estimators=answers)
+    question = fitting.question(asked.words.keys).checked()
+    folder = _folder(
+        asked,
+        trials,
+        files,
+        scenario=describe(question.scenario),
+        prior=question.has_prior,
+        estimators=_described(spec.estimators),
+    )
+    return own(question, spec.estimators, trials, spec.seed), folder
+
+
+def _of_log(asked: Single, files: list[str]) -> tuple[Own, AbstractContextManager[Path]]:
+    from ipe_bench.questions.own.tracks import own_log
+    from ipe_bench.real.logs import LogQuestion
+
+    spec = asked.spec
+    assert spec.state_model is not None
+    trials = spec.trials or _LOGS
+    asked.words.refuse(
+        ("error_scale",), "is of simulated trials; give the state model another prior"
+    )
+    readings = files[0] if len(files) == 1 else tuple(files)
+    log = LogQuestion.of(spec.state_model, readings, spec.estimators, spec.ignored, ()).log
+    folder = _folder(
+        asked,
+        trials,
+        files,
+        model=describe(log.model),
+        trackers=_described(spec.estimators),
+    )
+    return own_log(log, spec.estimators, trials, spec.seed), folder

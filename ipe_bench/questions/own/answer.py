@@ -1,0 +1,252 @@
+"""Shows which estimator to take for data like a user's own: sentences, tables, files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from ipe_bench.questions.own.maths import Claim, Own, Point
+from ipe_bench.report.page.writer import write_files
+from ipe_bench.report.tables.table import Part, Strong, Table, texts, words
+from ipe_bench.report.words import compact, duration
+
+NAME = "own"
+TABLE = "own.csv"
+_ROBUST = ("auto", "levenberg_marquardt")
+"""Estimators that are taken before others that do as well, since starts and data differ."""
+_MISSES = 0.95
+"""Share of data sets up to which an estimator is said to miss the best fit, if its interval lies
+below."""
+_NONE = 0.9
+"""Likewise, the share below which none is taken."""
+_TOO_SMALL = 0.88
+"""Share of 95 % intervals that hold the truth below which they are said to be too small: of one
+estimate, this verdict is true of fresh data sets in nine of ten cases."""
+_TOO_LARGE = 0.75
+"""Share of their width that would do, below which they are said to be too large."""
+_CHEAPER = 10.0
+"""Factor of the cost from which it is named."""
+
+
+def ranked(own: Own, point: Point) -> list[Claim]:
+    """Selects the estimators that are told no more than the user knows."""
+    return [one for one in point.claims if not one.told or own.states_prior]
+
+
+def taken(own: Own, point: Point) -> Claim | None:
+    """Chooses among those that find the best fit as often as any: one whose error bars are right,
+    and then the most robust. None: no estimator is ranked."""
+    equal = _equal(own, point)
+    right = [one for one in equal if _bars(one) == "about right"]
+    robust = [one for label in _ROBUST for one in right or equal if one.label == label]
+    return next(iter([*robust, *right, *equal]), None)
+
+
+def _equal(own: Own, point: Point) -> list[Claim]:
+    """Selects the estimators that find the best fit as often as any, to two standard deviations of
+    the share."""
+    claims = ranked(own, point)
+    top = max((one.finds for one in claims), default=0.0)
+    slack = 2.0 * np.sqrt(max(top * (1.0 - top), 0.01) / own.trials)
+    return [one for one in claims if one.finds >= top - slack]
+
+
+def takes_one(own: Own) -> bool:
+    """Tells if an estimator can be taken at the least minimum."""
+    best = taken(own, own.points[0])
+    return best is not None and best.finds_between[1] >= _NONE
+
+
+def _bars(one: Claim) -> str:
+    if one.holds < _TOO_SMALL:
+        return "too small"
+    return "too large" if one.factor < _TOO_LARGE else "about right"
+
+
+def _bars_in_words(one: Claim) -> str:
+    verdict = _bars(one)
+    share = f"{_about(one.holds)} hold the truth"
+    if verdict == "about right":
+        return f"its error bars are about right ({share})"
+    factor = one.factor if verdict == "too small" else 1.0 / one.factor
+    by = f" by about {factor:.2g}" if np.isfinite(factor) and factor < 100 else " by far"
+    return f"its error bars of {one.worst} are {verdict}{by} ({share})"
+
+
+def _about(share: float) -> str:
+    """Rounds a share to a percent, since what one data set says of it is off by some."""
+    return f"about {100 * share:.0f} %"
+
+
+def _missing(own: Own, claims: Sequence[Claim]) -> str:
+    """Says which estimators miss the best fit, and how often; empty if none does."""
+    lost = [one for one in claims if one.finds_between[1] < _MISSES]
+    if not lost:
+        return ""
+    first, *rest = [f"{one.label}{{}} in {_about(1 - one.finds)}" for one in lost]
+    said = [first.format(f" {_verb(own)}"), *(one.format("") for one in rest)]
+    return ", ".join(said)
+
+
+def _verb(own: Own) -> str:
+    return "loses the track" if own.moving else "misses the best fit"
+
+
+def advice(own: Own, point: Point) -> str:
+    """Says which estimator to take at a point, or none, without a full stop."""
+    best = taken(own, point)
+    if best is None:
+        return "no estimator is ranked, because all use a prior; state it by error_scale=X"
+    if best.finds_between[1] < _NONE:
+        remedy = "mend the model's prior"
+        if not own.moving:
+            at = ", ".join(f"{name} = {value:.4g}" for name, value in point.at.items())
+            remedy = f"start elsewhere, such as at {at}"
+        lost = f"{best.label} {_verb(own)} in {_about(1 - best.finds)}"
+        return f"take none: from this start the best, {lost}; {remedy}"
+    others = [one for one in ranked(own, point) if one is not best]
+    lost = _missing(own, others)
+    if not lost and others:
+        lost = f"no other {_verb(own)}"
+    return "; ".join(filter(None, [f"take {best.label}", _bars_in_words(best), lost]))
+
+
+def headline(own: Own) -> str:
+    """Returns the first line."""
+    noun = "logs" if own.moving else "data sets"
+    return f"On {own.trials} simulated {noun} like yours: {advice(own, own.points[0])}"
+
+
+def sentences(own: Own) -> Iterator[str]:
+    """Yields what else is to be said, the gravest first."""
+    first, *others = own.points
+    if others:
+        values = ", ".join(f"{name} = {value:.4g}" for name, value in others[0].at.items())
+        yield (
+            f"BUT your data have {len(own.points)} answers that fit. Were the truth at the other,"
+            f" {values}: {advice(own, others[0])}."
+        )
+    yield from _cheaper(own, first)
+    told = list(_told_a_prior(own, first))
+    if told:
+        yield f"Not ranked, because they use a prior that you did not state: {'; '.join(told)}."
+    for label, why in own.left_out.items():
+        yield f"{label} is left out: it {why}."
+
+
+def _told_a_prior(own: Own, point: Point) -> Iterator[str]:
+    """Says for each prior that estimators are told in the user's place which of them miss the best
+    fit."""
+    unranked = [one for one in point.claims if one not in ranked(own, point)]
+    for told in dict.fromkeys(one.told for one in unranked):
+        claims = [one for one in unranked if one.told == told]
+        labels = ", ".join(one.label for one in claims)
+        verb = "finds" if len(claims) == 1 else "find"
+        yield f"told {told}, {_missing(own, claims) or f'{labels} {verb} the best fit'}"
+
+
+def _cheaper(own: Own, point: Point) -> Iterator[str]:
+    """Names the cheapest estimator that does as well at a small share of the cost."""
+    best = taken(own, point)
+    if best is None or not takes_one(own):
+        return
+    equal = [one for one in _equal(own, point) if _bars(one) == _bars(best)]
+    cheapest = min(equal, key=lambda one: one.cost, default=best)
+    factor = best.cost / max(cheapest.cost, 1.0)
+    if factor >= _CHEAPER:
+        verb = "keeps the track" if own.moving else "finds the best fit"
+        yield (
+            f"{cheapest.label} {verb} about as often from this start, and costs about"
+            f" {factor:.0f} times less."
+        )
+
+
+def own_parts(name: str, own: Own) -> Iterator[Part]:
+    """Yields the sentences and tables, under the `name` of the model."""
+    yield Strong(f"{headline(own)}.")
+    yield from sentences(own)
+    for number, point in enumerate(own.points):
+        yield _table(name, own, point, number)
+    yield _meaning(own)
+
+
+def _table(name: str, own: Own, point: Point, number: int) -> Table:
+    claims = [
+        *ranked(own, point),
+        *(one for one in point.claims if one not in ranked(own, point)),
+    ]
+    values = ", ".join(f"{key} = {value:.4g}" for key, value in point.at.items())
+    where = f"logs that begin at {values}" if own.moving else f"truth {values}, noise {own.noise}"
+    columns = [
+        words("estimator", [one.label for one in claims]),
+        words("told", [one.told for one in claims]),
+        texts("keeps track, %" if own.moving else "finds, %", _shares(claims, "finds")),
+        texts("95 % bars hold, %", _shares(claims, "holds")),
+        words("worst", [one.worst for one in claims]),
+        texts("factor", [f"{one.factor:.2g}" for one in claims]),
+        texts("cost", [compact(one.cost) for one in claims]),
+        texts("time", [duration(one.seconds, 2) for one in claims]),
+    ]
+    return Table(f"own_{number + 1}" if number else "own", f"{name}: {where}", "", columns)
+
+
+def _shares(claims: Sequence[Claim], key: str) -> list[str]:
+    return [f"{100 * getattr(one, key):.1f}" for one in claims]
+
+
+def _meaning(own: Own) -> str:
+    if own.moving:
+        return (
+            "keeps track: the last states lie within the gate of the bound, in logs that begin"
+            " where yours does; bars: of the last states, over logs from the model's prior."
+            " factor: by which the bars would be right. All shares are approximate."
+        )
+    return (
+        "finds: the readings of the answer lie closer to those of the best fit than noise puts the"
+        " best fit to the truth. bars: 95 % intervals as `estimate` prints them, of the worst"
+        " parameter. factor: by which they would be right. cost: median evaluations of the model."
+        " All shares are approximate: the truth is your estimate, which is uncertain too."
+    )
+
+
+def frame(own: Own) -> pd.DataFrame:
+    """Returns a row per truth and estimator."""
+    rows = []
+    for number, point in enumerate(own.points, 1):
+        for one in point.claims:
+            low, high = one.finds_between
+            rows.append(
+                {
+                    "truth": number,
+                    "estimator": one.label,
+                    "told": one.told,
+                    "ranked": one in ranked(own, point),
+                    "trials": one.trials,
+                    "finds": one.finds,
+                    "finds_low": low,
+                    "finds_high": high,
+                    "holds": one.holds,
+                    "worst": one.worst,
+                    "too_small_by": one.factor,
+                    "cost": one.cost,
+                    "time_s": one.seconds,
+                    **point.at,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def write_own(folder: Path, name: str, own: Own) -> list[Path]:
+    """Writes the page, and own.csv with a row per truth and estimator; returns the files."""
+    tables = [one for one in own_parts(name, own) if isinstance(one, Table)]
+    return write_files(
+        folder,
+        NAME,
+        (TABLE, frame(own)),
+        headline(own),
+        list(sentences(own)),
+        [*tables, _meaning(own)],
+    )

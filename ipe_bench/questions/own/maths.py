@@ -1,0 +1,352 @@
+"""Simulates readings like a user's own, and counts which estimators find the best fit and whether
+their error bars hold the truth.
+
+Truths are the estimate, at every minimum that fits (a parametric bootstrap: Efron and Tibshirani,
+An Introduction to the Bootstrap, 1993, section 6.5); times and noise are those of the readings, and
+estimators start where the user does. The prior of an estimator is no part of the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ipe_bench.baselines import LevenbergMarquardt
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, deviations
+from ipe_bench.basics.streams import numbered
+from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
+from ipe_bench.measurements.base import Measurement, SubsetModel
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount, cost
+from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.real.estimation import Question
+from ipe_bench.real.examination import Examination
+from ipe_bench.real.fits import Fit, scaled
+from ipe_bench.real.profiles import CONFIDENCE, half_width
+from ipe_bench.statistics.intervals import clopper_pearson
+from ipe_bench.trials.thresholds import FIT_LEVEL
+
+MOST_POINTS = 3
+"""Minima that are simulated at most."""
+SIZES = (1.0, 10.0)
+"""Deviations of the prior in sizes of the start, where a user states none."""
+_SAME_CURVE = 1e-3
+"""Answers whose readings differ by less than this, in standard deviations, are of one curve."""
+_NOISE = 1
+"""The random stream of a trial's noise, as in `ipe_bench.trials.scenario`."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Holds what simulated data sets say of one estimator."""
+
+    label: str
+    told: str
+    """The prior that it was given; empty if it takes none."""
+    trials: int
+    found: int
+    """Data sets in which it found the best fit, or kept the track."""
+    held: int
+    """Data sets in which the 95 % interval of the worst parameter held the truth."""
+    worst: str
+    """That parameter."""
+    factor: float
+    """Times by which that interval is too narrow: the 95 % quantile of error over half-width."""
+    cost: float
+    """Median evaluations of the model, a Jacobian counting as many as it costs."""
+    seconds: float
+    """Mean time of a data set."""
+
+    @property
+    def finds(self) -> float:
+        return self.found / self.trials
+
+    @property
+    def holds(self) -> float:
+        return self.held / self.trials
+
+    @property
+    def finds_between(self) -> tuple[float, float]:
+        """The 95 % interval of `finds` over simulations, with the truth known."""
+        return clopper_pearson(self.found, self.trials)
+
+
+@dataclass(frozen=True)
+class Point:
+    """Holds one truth that fits the user's data, and what simulations at it say."""
+
+    at: Mapping[str, float]
+    """Its parameters in their own units."""
+    claims: Sequence[Claim]
+
+
+@dataclass(frozen=True)
+class Own:
+    """Answers which estimator to take for data like a user's own."""
+
+    trials: int
+    points: Sequence[Point]
+    """The least minimum first."""
+    noise: str
+    """The size of the noise, in words."""
+    states_prior: bool
+    """Whether the user stated what the estimators with a prior are told."""
+    left_out: Mapping[str, str]
+    """Estimators that do not suit the data, and why."""
+    moving: bool = False
+    """Whether the data are a log of states that move."""
+
+
+@dataclass(frozen=True)
+class _Truth:
+    """Holds a point (n,) in the coordinates of the model, with its copies: points of the same
+    readings."""
+
+    x: Array
+    copies: tuple[Array, ...]
+
+
+def require_answer(fit: Fit) -> None:
+    """Refuses an estimate from which nothing can be simulated: there is none, its fit is rejected,
+    or the readings leave it open."""
+    ended = f"the estimate ended {fit.status.label}"
+    p = fit.white_p
+    reasons = {
+        "the model does not fit the readings": fit.fits is False,
+        ended: not fit.passes,
+        f"the readings do not determine {', '.join(fit.undetermined)}": bool(fit.undetermined),
+        "there are no more readings than parameters": fit.degrees_of_freedom <= 0,
+        f"successive residuals resemble each other (p = {p:.1g}), so that the model or the noise is"
+        " wrong": p < FIT_LEVEL,
+        "the estimate is on a bound": bool(fit.held_at),
+        "the residuals are zero": not fit.chi_square or fit.level == 0.0,
+    }
+    for reason, holds in reasons.items():
+        if holds:
+            raise UserError(
+                f"{reason}: data sets simulated from it would not be like yours; see `ipe-bench"
+                " estimate` with the same words, and mend the model or its start first"
+            )
+
+
+def own(
+    question: Question,
+    estimators: Mapping[str, Estimator],
+    trials: int,
+    seed: int = 0,
+    watch: Callable[[str], object] = str,
+) -> Own:
+    """Simulates readings like those of a question, which names one estimator that answers it, and
+    lets `estimators` answer them.
+
+    Raises:
+        UserError: the question has no answer from which readings can be simulated.
+    """
+    fits, examination = question.fitted()
+    fit = fits[0]
+    require_answer(fit)
+    problem = _at_least(fit, examination)
+    with_prior = problem
+    if problem.prior_deviation is None:
+        with_prior = replace(problem, prior_deviation=np.ones(problem.measurement.n))
+    left_out = {}
+    for label, one in estimators.items():
+        why = one.hindrance(with_prior)
+        if why:
+            left_out[label] = why
+    kept = {label: one for label, one in estimators.items() if label not in left_out}
+    points = []
+    for truth in _truths(fit, examination, problem):
+        z = _drawn(fit, problem, truth.x, trials, seed)
+        claims = _claims(fit, problem, kept, truth, z, watch)
+        values = problem.measurement.physical(truth.x[None])[0].tolist()
+        names = [p.name for p in problem.measurement.physical_parameters]
+        points.append(Point(dict(zip(names, values, strict=True)), claims))
+    return Own(trials, points, _noise_in_words(problem), question.has_prior, left_out)
+
+
+def _at_least(fit: Fit, examination: Examination | None) -> Problem:
+    """Returns the problem of the readings with the level of noise at the least minimum, which the
+    estimate may have missed."""
+    problem = replace(fit.given.problem, R=fit.assumed.R)
+    if examination is None or fit.level is None or fit.estimated is not None:
+        return problem
+    least = min(examination.minima[0].chi_square, examination.chi_square)
+    return scaled(problem, float(np.sqrt(least / fit.degrees_of_freedom)))
+
+
+def _noise_in_words(problem: Problem) -> str:
+    deviation = problem.R.deviations
+    low = float(deviation.min())
+    high = float(deviation.max())
+    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+
+
+def _coordinates(model: Measurement, values: Array) -> Array:
+    """Returns x (n,) of values (n,) in the parameters' own units."""
+    while isinstance(model, SubsetModel):
+        model = model.whole
+    if isinstance(model, ConstrainedModel):
+        return model.inner(values)
+    return values / model.sizes
+
+
+def _truths(fit: Fit, examination: Examination | None, problem: Problem) -> list[_Truth]:
+    """Lists the minima that fit, the least first and each curve once."""
+    model = problem.measurement
+    estimate = fit.inner[: model.n]
+    places = [estimate]
+    if examination is not None:
+        minima = [
+            _coordinates(model, one.x[: model.n]) for one in examination.minima if one.as_good
+        ]
+        places = [*minima, estimate] if minima else places
+    found: list[_Truth] = []
+    for x in places:
+        same = [i for i, truth in enumerate(found) if _same_curve(problem, truth.x, x)]
+        if same:
+            # Of copies the last is named, which is the estimate itself.
+            found[same[0]] = _Truth(x, (*found[same[0]].copies, x))
+        elif x is not estimate or not found:
+            found.append(_Truth(x, (x,)))
+    return found[:MOST_POINTS]
+
+
+def _same_curve(problem: Problem, x: Array, y: Array) -> bool:
+    model = problem.measurement
+    with np.errstate(all="ignore"):
+        h, other = model.simulate(np.stack([x, y]))
+        apart = problem.R.whiten(h - model.near(other, h))
+    return bool((np.abs(apart) < _SAME_CURVE).all())
+
+
+def _drawn(fit: Fit, problem: Problem, x: Array, trials: int, seed: int) -> Array:
+    """Draws readings (trials, present) at x (n,), with the noise that is estimated or stated."""
+    given = fit.given
+    streams = numbered(seed, 0, trials, _NOISE)
+    if given.noise.estimated:
+        h = problem.measurement.simulate(x[None])[0]
+        e = np.array([rng.standard_normal(len(h)) for rng in streams])
+        return h + problem.R.coloured(e)
+    h = given.model.simulate(x[None])[0]
+    offset = given.model.offset
+    z = np.array([given.noise.corrupt(h, offset, rng) for rng in streams])
+    return np.ascontiguousarray(z[:, given.rows])
+
+
+def _claims(
+    fit: Fit,
+    problem: Problem,
+    estimators: Mapping[str, Estimator],
+    truth: _Truth,
+    z: Array,
+    watch: Callable[[str], object],
+) -> list[Claim]:
+    """Lets each estimator answer readings z (trials, m) of a truth, those with a prior once for
+    each that they are told."""
+    runs: list[tuple[str, str, Estimates]] = []
+    for label, one in estimators.items():
+        for told, known in _tellings(problem, one).items():
+            watch(label)
+            runs.append((label, told, estimate_safely(one, known, z)))
+    model = problem.measurement
+    curves = [_curves(model, each.x, z) for _, _, each in runs]
+    curves.append(_curves(model, _from_truth(problem, truth.x, z), z))
+    sums = np.stack([_squares(problem, z - h) for h in curves])
+    best = np.stack(curves)[sums.argmin(axis=0), np.arange(len(z))]
+    free = fit.degrees_of_freedom
+    claims = []
+    for (label, told, each), h, chi_square in zip(runs, curves, sums, strict=False):
+        # Its curve lies closer to the best fit's than noise puts that to the truth's.
+        near = _squares(problem, model.near(h, best) - best) <= model.n
+        scale = np.ones(len(z))
+        freedom = None
+        if fit.given.noise.estimated:
+            # As `estimate` reports it, which does not know the level.
+            scale = np.sqrt(chi_square / free)
+            freedom = free
+        width = half_width(CONFIDENCE, freedom) * scale
+        claims.append(_claim(label, told, model, each, truth, near, np.asarray(width)))
+    return claims
+
+
+def _tellings(problem: Problem, estimator: Estimator) -> dict[str, Problem]:
+    """Returns the problems of an estimator by the prior that it is told, in words."""
+    if "prior" not in estimator.needs:
+        return {"": problem.without_prior()}
+    if problem.prior_deviation is not None:
+        return {"your prior": problem}
+    ones = np.ones(problem.measurement.n)
+    return {
+        f"start ± {100 * size:.0f} %": replace(problem, prior_deviation=size * ones)
+        for size in SIZES
+    }
+
+
+def _curves(model: Measurement, x: Array, z: Array) -> Array:
+    """Computes the readings (trials, m) of answers x (trials, n), near those that were read; NaN
+    without an answer."""
+    h = np.full(z.shape, np.nan)
+    known = np.isfinite(x).all(axis=1)
+    with np.errstate(all="ignore"):
+        if known.any():
+            counting = CountingModel(model, EvaluationCount.zeros(len(z)))
+            found = counting.simulate(np.ascontiguousarray(x[known]), np.flatnonzero(known))
+            h[known] = model.near(found, z[known])
+    return h
+
+
+def _squares(problem: Problem, r: Array) -> Array:
+    """Sums the squares (trials,) of whitened residuals; infinite where they are not finite."""
+    with np.errstate(all="ignore"):
+        sums = np.sum(problem.R.whiten(r) ** 2, axis=1)
+    return np.nan_to_num(sums, nan=np.inf, posinf=np.inf)
+
+
+def _from_truth(problem: Problem, x: Array, z: Array) -> Array:
+    """Finds the least squares (trials, n) next to the truth, in the coordinates of the model."""
+    model = problem.measurement
+    known = [
+        ParameterInfo(p.name, nominal=float(value * p.size))
+        for p, value in zip(model.parameters, x, strict=True)
+    ]
+    there = replace(problem.without_prior(), measurement=ConstrainedModel(model, tuple(known)))
+    return estimate_safely(LevenbergMarquardt(), there, z).x
+
+
+def _claim(
+    label: str,
+    told: str,
+    model: Measurement,
+    each: Estimates,
+    truth: _Truth,
+    near: Array,
+    width: Array,
+) -> Claim:
+    """Counts what an estimator found, given the half-widths (trials,) of its intervals in standard
+    errors."""
+    deviation = np.full(each.x.shape, np.nan)
+    with np.errstate(all="ignore"):
+        if each.covariance is not None:
+            deviation = deviations(each.covariance)
+        ratios = np.stack([np.abs(each.x - x) / (deviation * width[:, None]) for x in truth.copies])
+    ratios = np.where(np.isfinite(ratios), ratios, np.inf)
+    # An answer at a copy, such as one of another sign, is held against that.
+    closest = ratios.max(axis=2).argmin(axis=0)
+    ratio = ratios[closest, np.arange(len(width))]
+    inside = (ratio <= 1.0).sum(axis=0)
+    worst = int(inside.argmin())
+    return Claim(
+        label,
+        told,
+        trials=len(width),
+        found=int(near.sum()),
+        held=int(inside[worst]),
+        worst=model.physical_parameters[worst].name,
+        factor=float(np.quantile(ratio[:, worst], CONFIDENCE, method="higher")),
+        cost=float(np.median(cost(each.simulations, each.jacobians, model.jacobian_cost))),
+        seconds=float(np.mean(each.seconds)),
+    )

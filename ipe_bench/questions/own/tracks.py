@@ -1,0 +1,89 @@
+"""Simulates logs like a user's own: whether trackers keep the track from where the log begins, and
+whether their error bars hold over the prior, whose intervals they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.questions.own.maths import Claim, Own, Point
+from ipe_bench.real.logs import Log, LogTracks
+from ipe_bench.real.profiles import CONFIDENCE, half_width
+from ipe_bench.states.auto import AutoTracker
+from ipe_bench.states.base import beginning_at
+from ipe_bench.states.trackers import Tracker
+from ipe_bench.trials.paths import PathBlock, StateScenario, track_safely
+from ipe_bench.trials.scoring import Columns
+
+
+def own_log(
+    log: Log,
+    trackers: Mapping[str, Tracker],
+    trials: int,
+    seed: int = 0,
+    watch: Callable[[str], object] = str,
+) -> Own:
+    """Simulates logs that begin where this one does, by its smoothed start, and lets `trackers`
+    follow them with the model's prior.
+
+    Raises:
+        UserError: the log has no track from which logs can be simulated.
+    """
+    track = LogTracks.of(log, "auto", AutoTracker())
+    if not track.passes:
+        why = track.message or "its innovations are not those of the model"
+        raise UserError(
+            f"the model does not fit the log ({why}), so logs simulated from it would not be like"
+            " yours; see `ipe-bench estimate` with the same words, and mend the model first"
+        )
+    scenario = StateScenario(log.model, seed)
+    tracks, _ = track_safely(AutoTracker(), scenario.assumed, log.z[None])
+    start = np.reshape(tracks.start.mean, (-1, log.model.n))[0]
+    paths = beginning_at(log.model, start).draw(0, trials, seed)
+    missing = np.isnan(log.z)
+    from_start = PathBlock(scenario, 0, replace(paths, z=np.where(missing, np.nan, paths.z)))
+    drawn = scenario.draw(0, trials)
+    from_prior = PathBlock(scenario, 0, replace(drawn, z=np.where(missing, np.nan, drawn.z)))
+    claims = []
+    for label, tracker in trackers.items():
+        watch(label)
+        estimates, kept = from_start.estimate(tracker)
+        _, over_prior = from_prior.estimate(tracker)
+        names = from_start.names
+        ratio = _ratios(over_prior, names) / half_width(CONFIDENCE, None)
+        inside = (ratio <= 1.0).sum(axis=0)
+        worst = int(inside.argmin())
+        factor = np.quantile(ratio[:, worst], CONFIDENCE, method="higher")
+        claims.append(
+            Claim(
+                label,
+                "",
+                trials,
+                found=int(np.sum(kept["success"])),
+                held=int(inside[worst]),
+                worst=names[worst],
+                factor=float(factor),
+                cost=float(np.median(estimates.simulations)),
+                seconds=float(np.mean(estimates.seconds)),
+            )
+        )
+    sizes = [state.size for state in log.model.states]
+    values = {
+        state.name: float(value * size)
+        for state, value, size in zip(log.model.states, start, sizes, strict=True)
+    }
+    return Own(trials, [Point(values, claims)], "", True, {}, moving=True)
+
+
+def _ratios(columns: Columns, names: list[str]) -> Array:
+    """Returns errors over reported deviations (trials, n) at the last epoch; infinite where there
+    is no track."""
+    error = np.stack([columns[f"error_{name}"] for name in names], axis=1)
+    deviation = np.stack([columns[f"deviation_{name}"] for name in names], axis=1)
+    with np.errstate(all="ignore"):
+        ratio = np.abs(error) / deviation
+    return np.where(np.isfinite(ratio), ratio, np.inf)

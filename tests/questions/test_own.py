@@ -1,0 +1,167 @@
+"""What simulated data sets say of estimators is what is known of them: of linear models by theory,
+and of two answers that fit by construction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ipe_bench as ib
+from ipe_bench.basics.errors import UserError
+from ipe_bench.plugins import standard
+from ipe_bench.questions.own.answer import advice, frame, headline, sentences, taken
+from ipe_bench.questions.own.maths import Claim, Own, Point, own
+from ipe_bench.questions.own.tracks import own_log
+from ipe_bench.real.estimation import Question
+from ipe_bench.real.logs import Log
+
+T = np.arange(12.0)
+LEAST_SQUARES = {"newton": ib.solvers.Newton(), "lm": ib.baselines.LevenbergMarquardt()}
+
+
+def asked(formula: str, start: dict[str, float], z: Any, **stated: Any) -> Question:
+    t = np.arange(float(len(z)))
+    model = ib.measurements.Formula(formula, start, columns={"t": t.tolist()})
+    answers = {"lm": ib.baselines.LevenbergMarquardt()}
+    return Question(model=model, readings=np.asarray(z), estimators=answers, **stated).checked()
+
+
+def line(noise: Any = None, **stated: Any) -> Question:
+    z = 3.0 + 0.5 * T + 0.2 * np.random.default_rng(3).standard_normal(len(T))
+    return asked("a*t + b", {"a": 1.0, "b": 1.0}, z, noise=noise, **stated)
+
+
+@pytest.mark.parametrize("noise", [None, ib.noise.Gaussian(0.2)])
+def test_intervals_of_a_line_hold_the_truth_in_95_percent(noise: Any) -> None:
+    """By Student's t if the level is estimated, and by the normal law if it is stated."""
+    found = own(line(noise), LEAST_SQUARES, 1000)
+    (point,) = found.points
+    for one in point.claims:
+        assert one.found == 1000
+        # The worse of two shares with a standard deviation of .7 %.
+        assert 0.925 < one.holds < 0.965
+        assert one.factor == pytest.approx(1.0, abs=0.12)
+    slope = np.polyfit(T, line().found.z, 1)
+    np.testing.assert_allclose([point.at["a"], point.at["b"]], slope, rtol=1e-6)
+
+
+def test_a_prior_is_told_to_filters_and_is_no_part_of_the_truth() -> None:
+    """With ten sizes MAP is least squares; without a stated prior it is not ranked."""
+    both = {**LEAST_SQUARES, "map_lm": ib.baselines.MapLM()}
+    found = own(line(), both, 100)
+    alone = own(line(), LEAST_SQUARES, 100)
+    assert next(one for one in found.points[0].claims if not one.told).held == (
+        alone.points[0].claims[0].held
+    )
+    rows = frame(found)
+    told = rows[rows["estimator"] == "map_lm"]
+    assert told["told"].tolist() == ["start ± 100 %", "start ± 1000 %"]
+    assert not told["ranked"].any()
+    assert told["finds"].iloc[1] == 1.0
+    stated = own(line(error_scale=5.0), both, 50)
+    assert frame(stated).query("estimator == 'map_lm'")["ranked"].all()
+
+
+def test_two_answers_that_fit_are_both_truths() -> None:
+    """(a - 1)^2 t - a has the same sum of squares on both sides of nearly 1; starts decide."""
+    z = 4.0 * T + 0.3 * np.random.default_rng(1).standard_normal(len(T))
+    question = asked("(a - 1)**2 * t + 0.001*a", {"a": 3.5}, z)
+    found = own(question, LEAST_SQUARES, 60)
+    assert sorted(round(point.at["a"]) for point in found.points) == [-1, 3]
+    shares = {round(point.at["a"]): point.claims[1].finds for point in found.points}
+    assert shares[3] == 1.0
+    assert any(one.startswith("BUT your data have 2 answers that fit") for one in sentences(found))
+
+
+def test_copies_of_the_same_curve_count_as_found() -> None:
+    """The sign of a is open in a^2 t; every answer has the right curve and the right bars."""
+    z = 4.0 * T + 0.3 * np.random.default_rng(1).standard_normal(len(T))
+    found = own(asked("a**2 * t", {"a": -3.0}, z), {"lm": ib.baselines.LevenbergMarquardt()}, 300)
+    (point,) = found.points
+    assert point.at["a"] == pytest.approx(-2.0, abs=0.05)
+    assert point.claims[0].found == 300
+    assert 0.91 < point.claims[0].holds < 0.98
+
+
+@pytest.mark.parametrize(
+    ("z", "stated", "said"),
+    [
+        (3.0 + T**2, {"noise": ib.noise.Gaussian(0.1)}, "does not fit the readings"),
+        (np.sin(np.arange(60.0) / 6), {}, "successive residuals resemble each other"),
+    ],
+)
+def test_a_rejected_fit_is_refused(z: Any, stated: Any, said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        own(asked("a*t + b", {"a": 1.0, "b": 1.0}, z, **stated), LEAST_SQUARES, 10)
+
+
+def claim(label: str, found: int, held: int = 190, **changed: Any) -> Claim:
+    one = Claim(label, "", 200, found, held, "a", 1.0, 10.0, 0.001)
+    return replace(one, **changed)
+
+
+def test_the_robust_one_is_taken_and_a_cheap_one_is_named_from_a_factor_of_ten() -> None:
+    claims = [claim("newton", 200, cost=5.0), claim("auto", 200, cost=49.0), claim("ekf", 100)]
+    found = Own(200, [Point({"a": 1.0}, claims)], "1", True, {})
+    assert headline(found).startswith(
+        "On 200 simulated data sets like yours: take auto; its error bars are about right (about"
+        " 95 % hold the truth); ekf misses the best fit in about 50 %"
+    )
+    assert not list(sentences(found))
+    dear = replace(found, points=[Point({"a": 1.0}, [*claims[:1], claim("auto", 200, cost=51.0)])])
+    assert list(sentences(dear)) == [
+        "newton finds the best fit about as often from this start, and costs about 10 times less."
+    ]
+
+
+def test_right_error_bars_come_before_robustness_and_finding_before_both() -> None:
+    claims = [claim("auto", 200, 150, factor=1.9), claim("newton", 199), claim("lm", 170)]
+    found = Own(200, [Point({"a": 1.0}, claims)], "1", True, {})
+    assert getattr(taken(found, found.points[0]), "label", "") == "newton"
+    alone = Own(200, [Point({"a": 1.0}, claims[:1])], "1", True, {})
+    assert "its error bars of a are too small by about 1.9 (about 75 %" in headline(alone)
+
+
+def test_none_is_taken_where_the_best_misses() -> None:
+    found = Own(200, [Point({"a": 1.5}, [claim("auto", 20), claim("lm", 10)])], "1", True, {})
+    assert advice(found, found.points[0]) == (
+        "take none: from this start the best, auto misses the best fit in about 90 %; start"
+        " elsewhere, such as at a = 1.5"
+    )
+
+
+def test_logs_of_a_linear_model_hold_their_intervals() -> None:
+    """Of a random walk the Kalman filter is exact, and begins where the log does."""
+    model = ib.states.Formulas(
+        next={"x": "x + w"},
+        readings={"z": "x"},
+        noise={"w": 0.3},
+        deviation={"z": 0.5},
+        spread={"x": 2.0},
+        count=25,
+    )
+    z = model.draw(0, 1, 5).z[0]
+    trackers = standard.constructed({"tracker": ("auto", "ekf")})
+    found = own_log(Log(model, z), trackers, 200)
+    for one in found.points[0].claims:
+        assert one.found == 200
+        assert 0.90 < one.holds < 0.99
+    with pytest.raises(UserError, match="does not fit the log"):
+        own_log(Log(model, z + np.linspace(0, 80, 25)[:, None] ** 2), trackers, 5)
+
+
+@pytest.mark.slow
+def test_the_command_writes_what_it_says(ipe_bench: Any, tmp_path: Path) -> None:
+    rows = [f"{t},{3 + 0.5 * t + 0.1 * (-1) ** (t // 2)}" for t in range(12)]
+    (tmp_path / "line.csv").write_text("\n".join(["t,y", *rows]) + "\n")
+    code, out, err = ipe_bench("run", "a*t + b", "line.csv", "trials=20", "solver=[newton]")
+    assert code == 0, err
+    said = out.split("Readings:")[1]
+    assert "On 20 simulated data sets like yours: take" in said
+    folder = tmp_path / "outputs/run-formula"
+    assert (folder / "own.csv").read_text().startswith("truth,estimator,told,ranked,trials,finds")
+    assert "On 20 simulated data sets like yours: take" in (folder / "own.html").read_text()
