@@ -12,6 +12,7 @@ from scipy.stats import chi2
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.function import function
+from ipe_bench.report.figures.setup import picture
 from ipe_bench.report.style import house_style
 
 NOISE = 2.5
@@ -132,8 +133,16 @@ def track() -> Figure:
     return fig
 
 
+def setup() -> Figure:
+    """Draws the paper's set-up, and the velocities of its first trial at error scale 33."""
+    model = ib.measurements.Gins()
+    bench = ib.Scenario(model, ib.noise.Quantization(step=0.02286), error_scale=33.0)
+    trials = bench.draw(0, 1)
+    return picture(model, trials.z[0], model.simulate(trials.x)[0])
+
+
 DRAWINGS = {
-    "explanation": {"error_scale": error_scale, "bound": bound, "nees": nees},
+    "explanation": {"error_scale": error_scale, "bound": bound, "nees": nees, "setup": setup},
     "howto": {"track": track},
 }
 """Drawings by name, by the folder of the pages that show them."""

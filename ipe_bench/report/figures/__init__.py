@@ -28,7 +28,7 @@ FIGURES = (
     "parameters",
     "tracks",
     "matrix",
-    "headline",
+    *("setup", "headline"),
 )
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
 NAMES = {
@@ -49,6 +49,7 @@ NAMES = {
         "root mean square error of each parameter and its bound; figure_2 and 3 of the paper's"
         " setting"
     ),
+    "figure_1": "the paper's set-up, and the 240 velocities of one trial with their errors",
     "one_track": "one trial: truth, readings, and two tracks with their 95 % bands",
     "tracks": "errors of all trials at each epoch, a panel for each tracker, and NEES",
 }

@@ -1,0 +1,51 @@
+"""Figure 1 of the paper shows what was read in the stored scenario, and stands nowhere else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ipe_bench as ib
+from ipe_bench.report.figures import setup
+from ipe_bench.report.figures.views import views
+from ipe_bench.report.style import house_style
+from ipe_bench.statistics.analysis import analyse
+
+STEP = 0.02286
+"""0.075 ft/s in m/s."""
+
+
+def drawn(folder, model, **more):
+    for scale in (1.0, 33.0, 100.0):
+        noise = ib.noise.Quantization(step=STEP, **more)
+        bench = ib.Scenario(model, noise, error_scale=scale, seed=7)
+        ib.run(bench, {"linear_lse": ib.baselines.LinearLSE()}, 2, output=folder)
+    with house_style():
+        return list(setup.draw(views(analyse([folder]))[1]))
+
+
+def test_the_velocities_are_multiples_of_the_step_and_their_errors_those_of_the_trial(tmp_path):
+    model = ib.measurements.Gins()
+    (drawing,) = drawn(tmp_path, model)
+    assert "Error scale 33" in drawing.caption
+    assert "240 velocities" in drawing.caption
+    _, read, errors = drawing.figure.axes
+
+    def points(ax):
+        lines = [line.get_ydata() for line in ax.lines if line.get_marker() == "o"]
+        return np.array(lines).reshape(4, 2, 30)
+
+    steps = points(read) / STEP
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    trial = ib.Scenario(model, ib.noise.Quantization(step=STEP), error_scale=33.0, seed=7)
+    z = trial.draw(0, 1).z.reshape(4, 30, 2).swapaxes(1, 2)
+    np.testing.assert_array_equal(points(errors), z)
+    # At three minutes the first case still has about the velocity that it began with.
+    assert points(read)[0, 0, 0] == pytest.approx(1500 * 0.3048, rel=0.03)
+    exact = np.array([line.get_ydata() for line in errors.lines if line.get_marker() != "o"])
+    assert np.abs(exact.reshape(4, 2, 30) - z).max() <= STEP / 2 * (1 + 1e-9)
+
+
+def test_other_options_have_no_such_figure(tmp_path):
+    assert drawn(tmp_path / "north", ib.measurements.Gins(latitude_deg=60.0)) == []
+    assert drawn(tmp_path / "other", ib.measurements.Gins(interval_min=6.0)) == []
