@@ -162,7 +162,7 @@ class Answer(Labelled[Fit]):
         if passes and not one.overstated:
             yield _intervals(one)
         if passes or not one.least:
-            for remark in remarks(one, _reading_labels(self.model)):
+            for remark in remarks(one, _Labels(self.model)):
                 yield Strong(remark) if remark.split(":")[0].isupper() else remark
 
     def _identifiability(self) -> Iterator[Strong]:
@@ -238,7 +238,7 @@ class Answer(Labelled[Fit]):
         one = self._stated
         found.append(f"{one.label}: {enumerate_few(_with_errors(one), 4)}.")
         if self.examination:
-            found += remarks(self.examination, _reading_labels(self.model))
+            found += remarks(self.examination, _Labels(self.model))
         return found[:3]
 
 
@@ -439,7 +439,7 @@ def _outliers(answer: Answer) -> Iterator[Table]:
     beyond = np.flatnonzero(np.any([f.outliers for f in told], axis=0))
     worst = {i: max((float(f.normalised[i]) for f in told), key=abs) for i in beyond}
     listed = sorted(worst, key=lambda i: -abs(worst[i]))[:_MOST_OUTLIERS]
-    labels = _reading_labels(answer.model)
+    labels = _Labels(answer.model)
     columns = [
         words("reading", [_where(labels[i]) for i in listed]),
         texts("residual", [f"{worst[i]:.1f}" for i in listed]),
@@ -455,9 +455,19 @@ def _where(label: Mapping[str, Any]) -> str:
     return ", ".join(f"{k}={v}" for k, v in label.items())
 
 
-def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
-    rows = zip(*model.index.values(), strict=True)
-    return [dict(zip(model.index, as_json(row), strict=True)) for row in rows]
+class _Labels(Sequence[dict[str, Any]]):
+    """Describes each of the m readings by the columns of its model, when it is asked for."""
+
+    def __init__(self, model: Measurement) -> None:
+        # A model may make its columns anew whenever it is asked.
+        self.columns = model.index
+        self.m = model.m
+
+    def __len__(self) -> int:
+        return self.m
+
+    def __getitem__(self, i: Any) -> Any:
+        return {name: as_json(column[i]) for name, column in self.columns.items()}
 
 
 def _intervals(found: Examination) -> Table:
@@ -635,7 +645,7 @@ def estimate_content(answer: Answer) -> dict[str, Any]:
     """Returns the content of estimate.json: readings, estimates, and the least minimum."""
     model = answer.model
     found = answer.examination
-    labels = _reading_labels(model)
+    labels = _Labels(model)
     return {
         "measurement": model.name,
         "reading_unit": model.reading_unit,
@@ -655,11 +665,12 @@ _STORED = (
 )
 
 
-def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
+def _fitted(one: Fit, labels: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     names = [p.name for p in one.model.physical_parameters]
     normalised = as_json(one.normalised)
     outliers = [
-        {**labels[i], "normalised_residual": normalised[i]} for i in np.flatnonzero(one.outliers)
+        {**labels[i], "normalised_residual": normalised[i]}
+        for i in np.flatnonzero(one.outliers).tolist()
     ]
     return {
         "status": one.status.label,
@@ -675,7 +686,7 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any]:
+def _examined(found: Examination, labels: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     names = [p.name for p in found.model.physical_parameters]
     told: dict[str, Any] = {"estimator": found.label, "estimates": _by_name(names, found.x)}
     if not found.overstated:
