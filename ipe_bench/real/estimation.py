@@ -18,9 +18,10 @@ from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, inform
 from ipe_bench.measurements.problem import Problem, require_function
 from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
 from ipe_bench.priors import GaussianPrior, Prior
-from ipe_bench.real.examination import Examination, examine
+from ipe_bench.real.examination import Examination
 from ipe_bench.real.fits import Fit, fit
 from ipe_bench.real.readings import SIGMA, Readings, open_together
+from ipe_bench.real.search import examined
 from ipe_bench.trials.scenario import Scenario
 
 
@@ -129,8 +130,9 @@ class Question:
     def fitted(self, watch: Callable[[str], object] = str) -> tuple[list[Fit], Examination | None]:
         """Fits every estimator, whose label `watch` is called with before, and examines the least
         minimum."""
-        fits = fit(self.problem, self.found.z, self.estimators, self.scenario.noise, watch)
-        return fits, examine(self.problem, self.found.z, fits)
+        noise = self.scenario.noise
+        fits = fit(self.problem, self.found.z, self.estimators, noise, watch)
+        return examined(self.problem, self.found.z, fits, noise)
 
     def _noise(self) -> Noise:
         """Returns the stated noise, or that of a file's column, or the model's own; else its level

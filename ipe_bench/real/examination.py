@@ -28,6 +28,7 @@ from ipe_bench.real.profiles import (
     wald_interval,
 )
 from ipe_bench.real.residuals import tested
+from ipe_bench.trials.thresholds import FIT_LEVEL
 
 BOOTSTRAPS = 500
 STARTS = 64
@@ -54,6 +55,8 @@ error."""
 class Minimum:
     """Holds a minimum of the sum of squares."""
 
+    inner: Array
+    """(n,) in the coordinates of the model."""
     x: Array
     """(n,) in the parameters' own units."""
     chi_square: float
@@ -284,8 +287,6 @@ class Examination:
         minima = maximise_likelihood(self.problem, repeated(self.z, len(starts)), starts)
         usable = minima.converged & np.isfinite(minima.chi_square) & finite(minima.covariance)
         least_first = np.argsort(minima.chi_square[usable], kind="stable")
-        freedom = self.freedom if isinstance(self.freedom, int) else None
-        limit = joint_region(len(self.inner), CONFIDENCE, freedom)
         found: list[Minimum] = []
         places: list[tuple[Array, Array]] = []
         for i in np.flatnonzero(usable)[least_first]:
@@ -297,10 +298,20 @@ class Examination:
             places.append((x, deviation))
             chi_square = float(minima.chi_square[i])
             least = found[0].chi_square if found else chi_square
-            as_good = chi_square - least <= limit
+            as_good = chi_square - least <= self._region(least, CONFIDENCE)
             values = self.model.physical(x[None])[0]
-            found.append(Minimum(values, chi_square, as_good, self._has_same_readings(x)))
-        return found or [Minimum(self.x, self.chi_square, True)]
+            found.append(Minimum(x, values, chi_square, as_good, self._has_same_readings(x)))
+        return found or [Minimum(self.inner, self.x, self.chi_square, True)]
+
+    def _region(self, least: float, confidence: float) -> float:
+        """Computes how far chi-square rises by chance from its least value to the true
+        parameters."""
+        n = len(self.inner)
+        if not isinstance(self.freedom, int):
+            return joint_region(n, confidence, None)
+        # The level of the noise is that at the least value.
+        level = min(1.0, least / self.freedom)
+        return level * joint_region(n, confidence, self.freedom)
 
     def _starts(self) -> Array:
         """Draws starts (starts, n) from the prior, behind the estimate."""
@@ -321,8 +332,10 @@ class Examination:
 
     @property
     def least(self) -> bool:
-        """Tells whether the estimate is the least minimum that was found."""
-        return self.chi_square <= self.minima[0].chi_square + _LOWER * max(1.0, self.chi_square)
+        """Tells whether no minimum that was found is lower by more than chance explains."""
+        least = self.minima[0].chi_square
+        chance = self._region(least, 1 - FIT_LEVEL)
+        return self.chi_square <= least + chance + _LOWER * max(1.0, self.chi_square)
 
     @property
     def ambiguous(self) -> list[Minimum]:

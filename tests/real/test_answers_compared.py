@@ -19,6 +19,7 @@ from ipe_bench.measurements import Formula
 from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.examination import Examination
 from ipe_bench.report.page.answer import estimate_content
+from ipe_bench.solvers import Auto
 
 T = np.linspace(0, 10, 41)
 
@@ -336,7 +337,8 @@ def test_answers_of_one_curve_are_told_apart_from_ambiguous_ones(expression, tru
 
 def test_answers_of_different_curves_are_ambiguous():
     """Readings at whole numbers do not tell a frequency from one that is 2 pi larger but for a
-    short interval."""
+    short interval. One that fits better by no more than chance explains does not refuse the
+    other."""
     t = np.arange(12.0)
     t[3] += 0.02
     model = Formula("sin(w*t)", {"w": 1.0}, {"t": t.tolist()})
@@ -346,3 +348,34 @@ def test_answers_of_different_curves_are_ambiguous():
     )
     assert "AMBIGUOUS: the readings fit as well" in str(answer)
     assert "exactly the same" not in str(answer)
+    found = answer.examination
+    assert found.minima[0].chi_square < found.chi_square - 1.0
+    assert answer[0].x == pytest.approx([1.0], abs=0.02)
+    assert answer.passes
+
+
+def test_turns_of_a_phase_are_named_once():
+    """-a sin(b t + c) is a sin(b t + c + pi), and a sin(-b t + pi - c)."""
+    model = Formula("a*sin(b*t+c)", {"a": 2.0, "b": 1.0, "c": 0.5}, {"t": T.tolist()})
+    z = model.simulate(model.nominal[None])[0] + 0.01 * np.random.default_rng(2).standard_normal(41)
+    answer = ib.estimate(model, z, {"lm": LevenbergMarquardt()}, noise=Gaussian(0.01))
+    (said,) = (one for one in answer.sentences() if "exactly the same" in one)
+    assert "c shifted by whole turns" in said
+    assert "a of the other sign, c shifted by half a turn" in said
+
+
+@pytest.mark.slow
+def test_the_first_line_is_of_the_answer_and_not_of_a_misfit():
+    """Where Levenberg and Marquardt's steps end, the readings tell nothing of a; at the answer they
+    tell all (the data of a question on curve_fit, drawn anew)."""
+    x = np.linspace(60, 3060, 200)
+    model = Formula("(a-c)*exp(-x/b)+c", {"a": 1.0, "b": 1.0, "c": 1.0}, {"x": tuple(x.tolist())})
+    noise = 0.2 * np.random.default_rng(3).standard_normal(200)
+    z = 80 * np.exp(-x / 400) + 20 + noise
+    answer = ib.estimate(model, z, {"auto": Auto(), "lm": LevenbergMarquardt()})
+    assert answer["lm"].undetermined
+    assert answer["auto"].x == pytest.approx([100.0, 400.0, 20.0], rel=0.01)
+    assert answer.finding().startswith("a = 100.")
+    first, *_ = str(answer).splitlines()
+    assert "do not determine" not in first
+    assert "(lm: where it ended, the readings do not determine a.)" in str(answer)

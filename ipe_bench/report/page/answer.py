@@ -24,6 +24,7 @@ from ipe_bench.real.estimation import Question
 from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import TOO_WELL, Fit
 from ipe_bench.real.residuals import LEAST_P
+from ipe_bench.real.search import LABEL as SEARCH
 from ipe_bench.report.page.writer import write_files
 from ipe_bench.report.tables.table import Part, Shown, Strong, Table, naming, texts, words
 from ipe_bench.report.words import enumerate_few, p_value
@@ -170,19 +171,23 @@ class Answer(Labelled[Fit]):
         found = structure(self.model)
         for sentence in found.sentences if found else ():
             yield Strong(f"Not identifiable: {sentence}.")
-        lacking = [one for one in self.fits if one.undetermined]
-        for one in lacking[:1]:
+        for one in self._lacking[:1]:
             what = "; ".join(one.undetermined)
             yield Strong(
                 f"The readings do not determine {what} (at {one.label}); fix parameters, or give"
                 " prior, until they do."
             )
 
+    @property
+    def _lacking(self) -> list[Fit]:
+        """The fits at which the readings do not determine all: of those that pass, if any does."""
+        told = [one for one in self.fits if one.passes] or self.fits
+        return [one for one in told if one.undetermined]
+
     def finding(self) -> str:
         """States the answer in one line: its first values, by whom, and how it was tested."""
-        lacking = [one for one in self.fits if one.undetermined]
-        if lacking:
-            return f"the readings do not determine {'; '.join(lacking[0].undetermined)}"
+        if self._lacking:
+            return f"the readings do not determine {'; '.join(self._lacking[0].undetermined)}"
         if not any(one.passes for one in self.fits):
             return "no estimate both converged and fits"
         if not self.passes:
@@ -338,6 +343,9 @@ def _notes(answer: Answer) -> Iterator[str]:
             yield f"{one.label}: {one.message}"
     for one in fits:
         yield from _notes_on_fit(one)
+        if answer.passes and one.undetermined and not one.passes:
+            what = "; ".join(one.undetermined)
+            yield f"({one.label}: where it ended, the readings do not determine {what}.)"
     yield from _notes_on_noise(answer)
     yield from _notes_on_priors(answer)
     if answer.model.fixed:
@@ -354,6 +362,8 @@ def _labels(fits: Iterable[Fit]) -> str:
 
 
 def _notes_on_fit(one: Fit) -> Iterator[str]:
+    if one.label == SEARCH:
+        yield f"{SEARCH}: Levenberg-Marquardt steps from the lowest minimum that more starts found."
     if one.beaten_by:
         yield (
             f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this"
@@ -553,7 +563,7 @@ def _other_minima(found: Examination, names: Sequence[str]) -> Iterator[str]:
         errors = found.standard_errors
         ways = dict.fromkeys(_changed(names, found.x, x, errors) or at(x) for x in equal)
         listed = "; with ".join(list(ways)[:_MOST_MINIMA])
-        yield f"The readings are exactly the same with {listed}: choose one of these answers."
+        yield f"The readings are exactly the same with {listed}."
 
 
 def _on_profiles(found: Examination, names: Sequence[str]) -> Iterator[str]:
@@ -576,7 +586,7 @@ def _on_profiles(found: Examination, names: Sequence[str]) -> Iterator[str]:
 
 
 def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
-    """Names the signs and exchanges of parameters that lead from x to y; empty if others are
+    """Names the signs, turns and exchanges of parameters that lead from x to y; empty if others are
     needed."""
     near = 0.01 * errors
     words = []
@@ -586,6 +596,14 @@ def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
         if abs(x[i] + y[i]) <= near[i]:
             words.append(f"{names[i]} of the other sign")
             continue
+        turned = _turned(y[i] - x[i], near[i])
+        if turned:
+            words.append(f"{names[i]} shifted by {turned}")
+            continue
+        turned = _turned(y[i] + x[i], near[i])
+        if turned:
+            words.append(f"{names[i]} of the other sign and shifted by {turned}")
+            continue
         taking = [j for j in left if abs(y[i] - x[j]) <= near[j]]
         exchanged = [j for j in taking if abs(y[j] - x[i]) <= near[i]]
         if not exchanged:
@@ -594,6 +612,15 @@ def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
         left.remove(other)
         words.append(f"{names[i]} and {names[other]} exchanged")
     return ", ".join(words)
+
+
+def _turned(shift: float, near: float) -> str:
+    """Words a shift by turns of an angle, in rad or degrees; empty if it is none."""
+    for half in (np.pi, 180.0):
+        halves = round(shift / half)
+        if near < 0.05 * half and halves and abs(shift - halves * half) <= near:
+            return "half a turn" if halves % 2 else "whole turns"
+    return ""
 
 
 def store(folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any]) -> Path:
