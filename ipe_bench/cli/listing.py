@@ -12,6 +12,7 @@ from ipe_bench.measurements.base import Measurement, labels
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, described
 from ipe_bench.report.tables.table import Table, words
+from ipe_bench.states.base import StateModel
 
 
 def list_command(names: Sequence[str], verbose: bool) -> int:
@@ -106,6 +107,19 @@ def _describe(option: plugins.Option) -> None:
     print()
     if option.group == "measurement":
         _describe_measurement(option)
+    if option.group == "state_model":
+        _describe_state_model(option)
+
+
+def _describe_state_model(option: plugins.Option) -> None:
+    """Says how trackers run the functions of a state model."""
+    try:
+        model = construct(option.config, "state_model")
+        assert isinstance(model, StateModel)
+        ways = model.remarks()
+    except UserError:  # one that is to be given options first
+        return
+    say(*ways or ["Trackers run transition and observe as machine code, with exact slopes."], "")
 
 
 def _describe_measurement(option: plugins.Option) -> None:

@@ -272,7 +272,11 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
         "block_size": job.block_size,
         "command": command,
     }
-    done = replace(begun, remarks=job.measurement.remarks(job.measurement.nominal))
+    if job.state_model is None:
+        remarks = job.measurement.remarks(job.measurement.nominal)
+    else:
+        remarks = job.state_model.remarks()
+    done = replace(begun, remarks=remarks)
     with watching(begun.label(command), lines=True) as watch:
         if job.precision is None:
             done = replace(done, failures=compute(*asked, **options, watch=watch))

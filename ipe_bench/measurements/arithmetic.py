@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import itertools
 import math
 import operator
 import re
@@ -49,6 +50,8 @@ def _angle(y: Any, x: Any) -> Any:
 
 FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     **trace.FUNCTIONS,
+    "asin": np.arcsin,
+    "acos": np.arccos,
     "atan": np.arctan,
     "ln": np.log,
     "log10": lambda a: np.log(a) / math.log(10.0),
@@ -70,7 +73,11 @@ PAIRS: dict[str, Callable[[Any, Any], Any]] = {
     "mod": lambda a, b: a - b * np.floor(_real(a / b)),
 }
 """Functions of two arguments; the remainder of `mod` has the sign of what divides."""
-_CALLED = (*FUNCTIONS, *SEVERAL, *PAIRS)
+_FROM = "at or above"
+"""A comparison of no formula, of which no note says that it never switches."""
+TABLES = {"interp": "x and a table x1, y1, x2, y2, ... of rising x1, x2, ..."}
+"""Functions of a table, which they write out in conditionals."""
+_CALLED = (*FUNCTIONS, *SEVERAL, *PAIRS, *TABLES)
 COMPARISONS = {
     "<": np.less,
     "<=": np.less_equal,
@@ -232,6 +239,10 @@ def _compared(signs: Sequence[str], trees: Sequence[Tree], texts: Sequence[str])
 def _called(function: str, arguments: Sequence[Tree]) -> Tree:
     """Builds the call of a function; empty if it takes another number of arguments."""
     number = len(arguments)
+    if function == "interp":
+        places = [tree[1] for tree in arguments[1::2] if tree[0] == "number"]
+        rises = all(a < b for a, b in itertools.pairwise(places))
+        return _interpolated(*arguments) if number > 4 and number % 2 and rises else ()
     if (function in SEVERAL and number > 1) or (function in PAIRS and number == 2):
         return _in_a_row(function, arguments)
     if function in FUNCTIONS and number == 1:
@@ -239,7 +250,22 @@ def _called(function: str, arguments: Sequence[Tree]) -> Tree:
     return ()
 
 
+def _interpolated(x: Tree, *table: Tree) -> Tree:
+    """Builds the value at x of straight lines between the points of a table, level beyond its
+    ends."""
+    points = list(zip(table[::2], table[1::2], strict=True))
+    found = points[0][1]
+    for (x1, y1), (x2, y2) in itertools.pairwise(points):
+        slope = ("/", ("-", y2, y1), ("-", x2, x1))
+        line = ("+", y1, ("*", slope, ("-", x, x1)))
+        found = ("if", (_FROM, x, x1), line, found)
+    last_x, last_y = points[-1]
+    return ("if", (_FROM, x, last_x), last_y, found)
+
+
 def _number_of_arguments(function: str) -> str:
+    if function in TABLES:
+        return TABLES[function]
     if function in FUNCTIONS:
         return "one argument"
     return "two arguments or more" if function in SEVERAL else "two arguments"
@@ -305,6 +331,7 @@ _BINARY: dict[str, Callable[[Any, Any], Any]] = {
     "or": lambda a, b: choose(a, a, b),
     **SEVERAL,
     **PAIRS,
+    _FROM: lambda a, b: np.greater_equal(a, b) * 1.0,
     **{sign: lambda a, b, holds=holds: holds(a, b) * 1.0 for sign, holds in COMPARISONS.items()},
 }
 

@@ -262,7 +262,11 @@ class Function(WrittenModel):
         return judged(self._rows, points, self.widest_steps, self.near, f"measurement.of={self.of}")
 
     def remarks(self, x: Array) -> tuple[str, ...]:
-        return self.flat(x)
+        remarks = self.flat(x)
+        why = "" if self._jax is not None else self._judged.why
+        if why:
+            remarks += (f"slopes of {self.of} are differences, as {why}; write it in NumPy",)
+        return remarks
 
     def simulate(self, x: Array) -> Array:
         return self._rows(x) if self._jax is None else self._jax[0](x)

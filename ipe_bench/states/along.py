@@ -141,6 +141,16 @@ class EpochFunctions:
     def at(self) -> Mapping[int, Recording]:
         return {k: one.at(i) for one in self.recordings for i, k in enumerate(one.epochs.tolist())}
 
+    def way(self, name: str) -> str:
+        """Says how the function of that name is run, and why not as machine code; empty if it is
+        recorded."""
+        if not self.why:
+            return ""
+        slopes = f"by differences, as {self.why_differences}"
+        if not self.why_differences:
+            slopes = "by complex steps"
+        return f"{name} runs in Python epoch by epoch, with slopes {slopes}: {self.why}"
+
     def by_epoch(self, why: str = "") -> EpochFunctions:
         """Returns the model's own functions, called epoch by epoch."""
         none = np.empty((1, 0))

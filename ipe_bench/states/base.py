@@ -80,9 +80,9 @@ class StateModel(Component, ABC):
     finds nothing to refuse.
 
     Trackers run f and h as compiled code that is recorded from them with its slopes, if they depend
-    on x and k alone and branch on no state (`np.where` is recorded); `ipe-bench check` says which
-    ones run epoch by epoch, and why. The slopes of these are complex steps, or differences if they
-    are not analytic.
+    on x and k alone and branch on no state (`np.where` is recorded); `remarks` says which ones run
+    epoch by epoch, and why. The slopes of these are complex steps where differences do not
+    contradict them, else differences.
 
     Process noise enters by its gain, so that a singular Q = G G' needs no special case. Known
     inputs and unequal steps follow from k. A measurement model with epochs is the state model whose
@@ -195,6 +195,11 @@ class StateModel(Component, ABC):
         other = copy.copy(self)
         vars(other)["_functions"] = other, (f.by_epoch(), h.by_epoch())
         return other
+
+    def remarks(self) -> tuple[str, ...]:
+        """Says how f and h are run that are not recorded, and why."""
+        f, h = self.epoch_functions
+        return tuple(filter(None, (f.way("transition"), h.way("observe"))))
 
     def transition_into(self, k: int) -> Recording:
         """Returns f of the step into epoch k as a function of states (..., n) that knows its

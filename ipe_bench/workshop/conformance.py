@@ -682,19 +682,14 @@ def is_recorded(model: StateModel) -> str | None:
     """Has the same transition and readings along whole paths, recorded and compiled, as epoch by
     epoch."""
     x = StateModel.draw(model, 0, 4).x
-    whys = []
     for name, functions in zip(("transition", "observe"), model.epoch_functions, strict=True):
         if functions.why:
-            slopes = ""
-            if functions.why_differences:
-                slopes = f", its slopes by differences ({functions.why_differences})"
-            whys.append(f"{name} runs epoch by epoch{slopes}: {functions.why}")
             continue
         for k in filter(model.moves, range(model.epochs)):
             here = x[:, k]
             same = same_values(functions.at[k](here), getattr(model, name)(here, k))
             assert same, f"{name} of epoch {k + 1} is not as recorded; mend `alike`"
-    return "; ".join(whys) or None
+    return "; ".join(model.remarks()) or None
 
 
 def wraps_its_angles(model: StateModel) -> None:

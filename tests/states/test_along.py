@@ -244,7 +244,7 @@ def test_what_cannot_be_recorded_runs_epoch_by_epoch_and_check_says_so(name):
     assert why in f.why
     assert not h.why
     notes = " ".join(finding.note for finding in check_component("model", model))
-    assert "transition runs epoch by epoch" in notes
+    assert "transition runs in Python epoch by epoch, with slopes by" in notes
     assert why in notes
     x = path(model)
     np.testing.assert_array_equal(model.values_along(x)[0][:, 3], model.transition(x[:, 3], 3))
@@ -313,7 +313,7 @@ def test_functions_that_are_not_analytic_have_their_slopes(by):
 def test_check_names_slopes_by_differences():
     model = Angles(piece=lambda x, k: np.array(x.tolist(), dtype=float))
     notes = " ".join(finding.note for finding in check_component("model", model))
-    assert "transition runs epoch by epoch, its slopes by differences" in notes
+    assert "transition runs in Python epoch by epoch, with slopes by differences, as" in notes
 
 
 def test_check_finds_epochs_that_are_wrongly_called_alike():
