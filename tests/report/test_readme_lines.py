@@ -172,7 +172,7 @@ def test_every_line_runs_in_order_and_the_table_comes_out(tmp_path):
     analysis = analyse([tmp_path / "outputs/headline"])
     assert block(analysis) in README
     shares = shown_shares()
-    assert len(shares) == 7
+    assert len(shares) == 6
     trials = ib.load(tmp_path / "outputs/headline")
     for name, (by_scale, cost) in shares.items():
         own = found.xs(name, level="estimator")["success"]

@@ -23,7 +23,7 @@ INDEX = ROOT / "ipe_bench/report/docs/pages/index.md"
 PICTURES = (ROOT / ".assets" / "headline.png", ROOT / ".assets" / "headline_dark.png")
 BEGINS = "<!-- make gallery -->\n"
 ENDS = "<!-- end -->\n"
-_ROWS = 7
+_ROWS = 6
 """Estimators of the table."""
 _COLUMNS = 2
 """Error scales of the table: the largest ones."""
