@@ -16,6 +16,8 @@ from ipe_bench.workshop.kinds import KINDS, MODELS
 _ABOUT = """\
 ipe-bench: which estimator to trust with nonlinear measurements
 
+  ipe-bench estimate oxygen.py oxygen.csv         your function, your readings
+  ipe-bench run oxygen.py oxygen.csv              which estimator to take for them
   ipe-bench run +experiment=paper                 the paper's experiment
   ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[ekf]"
   ipe-bench run -m error_scale=1,10,100 seed=1,2  a sweep, by Hydra

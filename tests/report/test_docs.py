@@ -27,7 +27,7 @@ from shared.synthetic_store import Pretender, Seeker, Synthetic
 
 import ipe_bench
 from ipe_bench.baselines import EKF
-from ipe_bench.cli import words
+from ipe_bench.cli import shorts, words
 from ipe_bench.cli.main import COMMANDS
 from ipe_bench.cli.session import jobs_of, session
 from ipe_bench.measurements import Polynomial
@@ -468,7 +468,8 @@ def test_the_estimates_of_the_first_hour_come_out_with_a_profile_that_allows_no_
 def test_the_commands_of_the_first_hour_are_composed(command, hour):
     """What they ask for is understood; the slow test of all pages runs them."""
     own = ("-m", "at=outputs/estimate-function")
-    given = words.read(command[0], [word for word in command[1:] if word not in own])
+    short = shorts.read(command[0], [word for word in command[1:] if word not in own])
+    given = words.read(command[0], short.in_full)
     with session():
         jobs = jobs_of(given, multirun="-m" in command)
     assert len(jobs.specs) == (3 if "-m" in command else 1)

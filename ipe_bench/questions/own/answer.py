@@ -133,8 +133,9 @@ def sentences(own: Own) -> Iterator[str]:
     told = list(_told_a_prior(own, first))
     if told:
         yield f"Not ranked, because they use a prior that you did not state: {'; '.join(told)}."
-    for label, why in own.left_out.items():
-        yield f"{label} is left out: it {why}."
+    for why in dict.fromkeys(own.left_out.values()):
+        labels = [label for label, reason in own.left_out.items() if reason == why]
+        yield f"Left out, because each {why}: {', '.join(labels)}."
 
 
 def _told_a_prior(own: Own, point: Point) -> Iterator[str]:
