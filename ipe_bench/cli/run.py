@@ -3,6 +3,7 @@ the results."""
 
 from __future__ import annotations
 
+import functools
 import re
 import shlex
 from argparse import Namespace
@@ -114,10 +115,16 @@ def run_command(arguments: Sequence[str]) -> int:
         command = shlex.join(["ipe-bench", "run", *arguments])
         task = Task(command, words.files, words.standard_baselines)
         if jobs.told:
+            stored = _Stored()
             for told, spec in zip(jobs.told, jobs.specs, strict=True):
-                task.compute(told, spec)
+                task.compute(told, spec, stored.of(spec))
         outcomes = task.outcomes if jobs.told else jobs.launch(task) or task.outcomes
     return _conclude(jobs, outcomes)
+
+
+def _read(output: str) -> Results:
+    """Reads what a folder holds; nothing if it is not there yet."""
+    return Results.read([output] if Path(output).is_dir() else [])
 
 
 def _missing(jobs: Jobs) -> list[str]:
@@ -125,14 +132,13 @@ def _missing(jobs: Jobs) -> list[str]:
     lines = []
     stored = 0
     missing = 0
+    stored_of = functools.cache(_read)
     # The words of a job are not known where a sweeper of Hydra's chooses them.
     told_of = jobs.told or [jobs.words.text] * len(jobs.specs)
     for told, job in zip(told_of, jobs.specs, strict=True):
         validate([job.scenario], job.estimators, job.count, job.block_size)
         cells = result_keys(job.scenario, job.estimators)[1:]
-        output = Path(job.output)
-        folders = [output] if output.is_dir() else []
-        results = Results.read(folders, keys={cell.key for cell in cells})
+        results = stored_of(job.output)
         lacking = 0
         for cell in cells:
             lacking += sum(stop - start for start, stop in results.missing(cell.key, job.count))
@@ -249,11 +255,11 @@ class Task:
             spec = replace(spec, execution=Serial())
         return self.compute(words, spec)
 
-    def compute(self, words: Sequence[str], spec: Spec) -> Outcome:
-        """Computes a job."""
+    def compute(self, words: Sequence[str], spec: Spec, known: Results | None = None) -> Outcome:
+        """Computes a job; `known` is what was read of its results before."""
         done = Outcome(spec.output, w.as_typed(words, self.files))
         try:
-            done = _computed(spec, done, self.command)
+            done = _computed(spec, done, self.command, known)
             accept(done.output, done.job)
         except UserError as error:
             done = replace(done, mistake=str(error))
@@ -261,7 +267,23 @@ class Task:
         return done
 
 
-def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
+class _Stored:
+    """Holds what the folders of a sweep had before it, each read once."""
+
+    def __init__(self) -> None:
+        self.read = functools.cache(_read)
+        self.changed: set[str] = set()
+
+    def of(self, job: Spec) -> Results | None:
+        """Returns what was read of a job's results; None if a job before it added to them."""
+        keys = {cell.key for cell in result_keys(job.scenario, job.estimators)}
+        known = self.read(job.output)
+        shared = not self.changed.isdisjoint(keys)
+        self.changed |= {key for key in keys if job.precision or known.missing(key, job.count)}
+        return None if shared or job.precision else known
+
+
+def _computed(job: Spec, begun: Outcome, command: str, known: Results | None) -> Outcome:
     """Computes the trials that are asked for, or just enough."""
     if job.write_readings is not None:
         write_trial(job, Path(job.write_readings), job.write_readings_trial)
@@ -279,7 +301,7 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
     done = replace(begun, remarks=remarks)
     with watching(begun.label(command), lines=True) as watch:
         if job.precision is None:
-            done = replace(done, failures=compute(*asked, **options, watch=watch))
+            done = replace(done, failures=compute(*asked, **options, watch=watch, known=known))
         else:
             from ipe_bench.statistics.stopping import NARROW, compute_until
 

@@ -385,7 +385,9 @@ class Results:
         """Renames what is damaged, so that it is computed again under its own name; returns a line
         for each file."""
         lines = []
-        for path, reason in self.damaged.items():
+        damaged = list(self.damaged.items())
+        self.damaged.clear()  # what is computed anew has the same name
+        for path, reason in damaged:
             aside = path.with_name(f"{path.stem}.damaged-{uuid.uuid4().hex[:8]}")
             # Another run may have done so at this moment.
             with contextlib.suppress(FileNotFoundError):

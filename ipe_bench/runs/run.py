@@ -53,28 +53,34 @@ def compute(
     record_as: str | None = None,
     further: Mapping[str, Any] | None = None,
     command: str | None = None,
+    known: Results | None = None,
 ) -> tuple[str, ...]:
     """Computes and stores what is missing under `output`, in blocks of `block_size` trials, which
     changes no number; returns the messages of what failed.
 
     The run is recorded, unless nothing is missing and the same was asked for before: under a new
     name, or under `record_as`, in place of what is there; with `further` facts, and the `command`
-    as it was typed. Raises UserError, before anything is computed, if that is impossible, and
-    StorageError if nothing can be stored any more.
+    as it was typed. `known` is what was read of these cells before, if nothing was added to them
+    since: a sweep reads its folder once.
+
+    Raises:
+        UserError: it is impossible; nothing was computed.
+        StorageError: nothing can be stored any more.
     """
     # Absolute: workers may have another working folder.
     store = Store(Path(output).absolute())
     scenarios = pinned(list(scenarios))
     estimators = {label: pinned(one) for label, one in estimators.items()}
     # What is stored of a scenario shows that its numbers can be computed with, without drawing any.
-    stored = {part.key for part in store.parts()}
-    untried = [scenario for scenario in scenarios if ResultKey(scenario).key not in stored]
+    keys = [ResultKey(scenario).key for scenario in scenarios]
+    stored = {part.key for part in store.parts(keys)} if known is None else known.stored
+    untried = [scenario for scenario, key in zip(scenarios, keys, strict=True) if key not in stored]
     block_size = block_size_for(trials) if block_size is None else block_size
     validate(scenarios, estimators, trials, block_size, untried=untried)
     store.prepare()
     of_scenarios = [result_keys(scenario, estimators) for scenario in scenarios]
     cells = [cell for several in of_scenarios for cell in several]
-    results = Results.read([store.directory], keys={cell.key for cell in cells})
+    results = known or Results.read([store.directory], keys={cell.key for cell in cells})
     aside = results.set_aside()
     tasks: list[Task] = []
     for several in of_scenarios:
@@ -88,7 +94,10 @@ def compute(
     for line in aside:
         log.warning(line)
     failures = run_tasks(tasks, execution or Serial(), store, watch or (lambda progress: None))
+    touched = {cell.key for task in tasks for cell in task.cells}
     for key in {cell.key for cell in cells}:
+        if key not in touched and len(results.stored[key].parts) == 1:
+            continue
         try:
             store.merge(key)
         except (Unusable, StorageError) as error:

@@ -7,6 +7,8 @@ import pytest
 
 import ipe_bench as ib
 from ipe_bench.cli.main import main
+from ipe_bench.runs import results
+from ipe_bench.runs.store import Store
 
 LAUNCHERS = {"joblib": "hydra-joblib-launcher", "submitit_local": "hydra-submitit-launcher"}
 EACH = ["basic", *(pytest.param(launcher, marks=pytest.mark.slow) for launcher in LAUNCHERS)]
@@ -54,3 +56,41 @@ def test_a_job_that_is_refused_is_told_and_stands_in_the_books(
     assert "noise.deviation=1e-150 and 1 more)" in capsys.readouterr().err.splitlines()[-1]
     assert main(["status", "out"]) == 1
     assert capsys.readouterr().out.count("refused: ") == 2
+
+
+def counted(monkeypatch, home, name):
+    """Counts the calls of a function from here on."""
+    calls = []
+    inner = getattr(home, name)
+
+    def outer(*arguments, **options):
+        calls.append(arguments)
+        return inner(*arguments, **options)
+
+    monkeypatch.setattr(home, name, outer)
+    return calls
+
+
+def test_a_sweep_reads_its_folder_once_and_computes_once_what_its_jobs_share(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sweep = [*SWEEP[:3], "figures=none", "execution=serial", "output=out", "baseline=[linear_lse]"]
+    sweep += ["error_scale=1,2,3", "solver=[newton],[fixed_point]"]
+    written = counted(monkeypatch, Store, "write")
+    assert main(["run", "-m", *sweep]) == 0
+    assert len(written) == 3 * 4  # with the truth, and once what six jobs have in pairs
+    read = counted(monkeypatch, results, "read_record")
+    assert main(["run", "-m", *sweep]) == 0
+    assert len(written) == 3 * 4
+    assert len(read) == 3 * len(list((tmp_path / "out/runs").iterdir()))
+
+
+def test_a_damaged_file_of_a_sweep_is_computed_once_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    sweep = ["run", "-m", *SWEEP, "execution=serial", "output=out"]
+    assert main(sweep) == 0
+    before = rows("out")
+    first = min((tmp_path / "out/trials").iterdir())
+    first.write_bytes(first.read_bytes()[:-50])
+    assert main(sweep) == 0
+    assert len(list((tmp_path / "out/trials").glob("*.damaged-*"))) == 1
+    pd.testing.assert_frame_equal(rows("out"), before, check_exact=True)

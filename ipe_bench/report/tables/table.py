@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 LONG = 45
 """Number of rows from which a LaTeX table runs over pages."""
-MOST_ROWS = 2000
+MOST_ROWS = 400
 """Largest number of rows of a table on an HTML page."""
 COLUMN = 3.5
 """Inches of IEEE's column."""
