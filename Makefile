@@ -24,7 +24,7 @@ cluster: .venv/ready
 campaigns: .venv/ready
 	$(BIN)/pytest -n auto -m campaign
 
-# How closely numbers agree with what they are checked against: tests/oracles.json and the page of it. TESTS="FILE ..."
+# How closely numbers agree with what they are checked against: tests/oracles.json. TESTS="FILE ..."
 # runs the marked tests of these files alone; those of plugins run in their environment, after `make plugins`.
 oracles: .venv/ready
 	RECORD_ORACLES=1 $(BIN)/pytest -m oracle $(TESTS)

@@ -1,8 +1,8 @@
 """Numbers held against sources that nobody here wrote: the mark `oracle`, how closely they agreed,
 and the page of it.
 
-`make oracles` records what was seen in tests/oracles.json, and writes the tables of
-reference/checked.md from it.
+`make oracles` records what was seen in tests/oracles.json, of which `make docs` writes the tables
+of reference/checked.md.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ SUBJECTS = {
     "plugins": "Plugins",
 }
 """Headings of the page by the beginning of a test's path; the first that fits is its own."""
-BEGIN, END = "<!-- written by `make oracles`, from here -->\n", "<!-- to here -->\n"
+HERE = "<!-- `make docs` writes the tables here -->\n"
+"""The line of the page that its tables replace."""
 
 
 @dataclass(frozen=True)
@@ -171,8 +172,6 @@ def record() -> None:
         json.dumps([asdict(row) for row in kept], indent=1, ensure_ascii=False) + "\n",
         encoding="utf-8",
     )
-    before, _, after = in_page()
-    PAGE.write_text(before + BEGIN + tables(kept) + END + after, encoding="utf-8")
 
 
 def rows() -> list[Row]:
@@ -259,9 +258,7 @@ def tables(recorded: Iterable[Row]) -> str:
     )
 
 
-def in_page() -> tuple[str, str, str]:
-    """Returns what stands on the page before its tables, they themselves, and what stands after
-    them."""
-    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    written, _, after = rest.partition(END)
-    return before, written, after
+def with_tables(page: str) -> str:
+    """Returns the page with the tables of what is recorded."""
+    before, after = page.split(HERE)
+    return f"{before}{tables(rows())}{after}"

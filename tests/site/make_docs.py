@@ -24,6 +24,7 @@ from typing import Any
 import pandas as pd
 from gallery_frames import SUFFIX, Computed, read
 from readme import write_readme
+from shared import oracles
 from state_tables import with_tables
 from word_drawings import write_drawings
 
@@ -125,8 +126,10 @@ SHOWN = SOURCES.parents[2] / ".assets" / "headline.md"
 """The stored report that the repository shows without a site."""
 STORED = SOURCES / "gallery"
 """The folder of what pages of the gallery are drawn from."""
-TABLES = SOURCES / "pages" / "explanation" / "tables_of_states.md"
+TABLES = "explanation/tables_of_states.md"
 """The page of what is stored of the experiment `states`."""
+CHECKED = "reference/checked.md"
+"""The page of what is recorded of the tests that compare with a source."""
 
 
 def build(output: Path, trials: int) -> int:
@@ -140,11 +143,21 @@ def build(output: Path, trials: int) -> int:
     print("reference pages ...", flush=True)
     write_reference(source / "reference")
     write_drawings(source)
+    write_tables(source)
     write_gallery(source / "gallery", output / "results", trials)
     places = (output / "html", output / "doctrees")
     site = Sphinx(source, None, *places, "html", SETTINGS, warningiserror=True, freshenv=True)
     site.build()
     return site.statuscode
+
+
+def write_tables(source: Path) -> None:
+    """Writes the tables that are built and not stored into their pages."""
+    states = read(STORED / f"states{SUFFIX}").analysis
+    page = source / TABLES
+    write_text(page, with_tables(page.read_text(encoding="utf-8"), states))
+    page = source / CHECKED
+    write_text(page, oracles.with_tables(page.read_text(encoding="utf-8")))
 
 
 def printed_by(command: Sequence[str], columns: int = 80) -> str:
@@ -411,9 +424,6 @@ def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
         if option.name == SHOWN.stem:
             write_text(SHOWN, stored_as_markdown(option))
             write_readme(computed.analysis)
-        if option.name == "states":
-            page = TABLES.read_text(encoding="utf-8")
-            write_text(TABLES, with_tables(page, computed.analysis))
     return 0
 
 

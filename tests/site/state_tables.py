@@ -15,8 +15,8 @@ from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA, holm, mcnemar
 from ipe_bench.statistics.statistic import ALL
 
-BEGIN, END = "<!-- `make gallery` writes what follows -->\n", "<!-- up to here -->\n"
-"""Marks in the page before and behind its tables."""
+HERE = "<!-- `make docs` writes the tables here -->\n"
+"""The line of the page that its tables replace."""
 FIRST = "auto"
 """The tracker that is compared with all others in pairs."""
 MODELS = {
@@ -42,11 +42,10 @@ MEASURES: dict[str, tuple[str, Callable[[float], str]]] = {
 
 
 def with_tables(page: str, analysis: Analysis) -> str:
-    """Returns the page with the tables of an analysis between its marks."""
-    before, rest = page.split(BEGIN)
-    _, after = rest.split(END)
+    """Returns the page with the tables of an analysis."""
+    before, after = page.split(HERE)
     written = "\n".join(_parts(analysis))
-    return f"{before}{BEGIN}\n{written}\n{END}{after}"
+    return f"{before}\n{written}\n{after}"
 
 
 def _parts(analysis: Analysis) -> Iterator[str]:
