@@ -17,7 +17,7 @@ import importlib
 import itertools
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 if TYPE_CHECKING:
     from ipe_bench import baselines, measurements, noise, priors, solvers, states

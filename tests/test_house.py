@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import ast
 import functools
+import tomllib
 from pathlib import Path
+
+import yaml
 
 import ipe_bench
 
 HOUSE = Path(ipe_bench.__file__).parent
+ROOT = HOUSE.parent
 LINE = [
     *(
         ["basics"],
@@ -163,3 +167,13 @@ def test_rooms_import_each_other_in_no_circle_and_at_most_fourteen_deep():
 
     chains = [deepest(room, ()) for room in imports]
     assert max(map(len, chains)) <= 14, max(chains, key=len)
+
+
+def test_every_place_names_one_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    zoo = tomllib.loads((ROOT / "plugins/zoo/pyproject.toml").read_text(encoding="utf-8"))[
+        "project"
+    ]
+    notes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert citation["version"] == zoo["version"] == ipe_bench.__version__
+    assert f"\n## {ipe_bench.__version__}, {citation['date-released']}\n" in notes
