@@ -173,10 +173,14 @@ class Fitting:
                 known.append(found.x[i])
         return fits
 
+    def counts(self, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Counts the distinct minima of the trials `rows` that fit."""
+        return np.array([len(self.known[i]) for i in rows], np.int64)
+
     def report(self, estimates: Estimates) -> Estimates:
         """Reports the estimates with the extras `minima`, the number of distinct ones that fit, and
         `ambiguous`, 1 where there are several; the others are their `alternatives`."""
-        minima = np.array([len(known) for known in self.known], dtype=float)
+        minima = self.counts(np.arange(len(self.known))).astype(float)
         estimates.extras |= {"minima": minima, "ambiguous": (minima > 1).astype(float)}
         assert estimates.covariance is not None
         deviation = deviations(estimates.covariance)

@@ -186,18 +186,18 @@ class Stages(Attempts):
         return points[chosen]
 
     def _points(self, k: int, *, wide: bool = False) -> Array:
-        """Draws 20 random points (20, n): of the prior if one is known, else of any size in the
-        quadrant of the nominal point or one nearby (`wide`), of any sign (k even), or about the
-        nominal point."""
+        """Draws 20 random points (20, n): of any size in the quadrant of the nominal point or one
+        nearby (`wide`), which a prior that is too narrow does not hinder; else of the prior if one
+        is known, of any sign (k even), or about the nominal point."""
         x0 = self.problem.x0
         shape = (_LOOKS, len(x0))
         rng = generator(k)
-        if self.prior is not None:
-            return x0 + self.prior * rng.standard_normal(shape)
         if wide:
             turned = np.where(rng.uniform(size=shape) < 0.8, 1.0, -1.0)
             sign = turned * np.where(x0 < 0, -1.0, 1.0)
             return sign * 10 ** rng.normal(0.0, 1.0, shape)
+        if self.prior is not None:
+            return x0 + self.prior * rng.standard_normal(shape)
         if k % 2 == 0:
             return 10 ** rng.uniform(-2, 0.5, shape) * rng.choice([-1.0, 1.0], shape)
         factor = 10 ** rng.uniform(-2.5, 0.5, (_LOOKS, 1))
