@@ -351,7 +351,7 @@ def examine(
     """Examines the least of the minima that estimators without a prior found, of several that found
     it the first that passes; None if none of them found one."""
     best = _best(fits)
-    if best is None:
+    if best is None or best.exact:
         return None
     held_at = best.held_at
     if held_at:

@@ -194,7 +194,9 @@ class Answer(Labelled[Fit]):
             return "no estimate is at the lowest minimum of chi-square"
         one = self._stated
         found = [f"{enumerate_few(_with_errors(one), 2)} by {one.label}"]
-        if _resembling(one):
+        if one.exact:
+            found.append("which meets every reading exactly")
+        elif _resembling(one):
             found.append("in doubt, for successive residuals resemble each other")
         elif one.fits:
             found.append("which passes every test")
@@ -224,7 +226,9 @@ class Answer(Labelled[Fit]):
         tested = enumerate_few([one.label for one in passing if not _resembling(one)])
         resembling = enumerate_few([one.label for one in passing if _resembling(one)])
         tests = "every test"
-        if not passing[0].fits:
+        if passing[0].exact:
+            tests = "the only test that readings without noise allow: residuals are round-off"
+        elif not passing[0].fits:
             tests = (
                 "the available tests; the size of the residuals is not tested, for the noise level"
                 " is unknown"
@@ -394,7 +398,14 @@ def _notes_on_noise(answer: Answer) -> Iterator[str]:
         known = _labels(one for one in fits if one.estimated and not one.estimated.maximal)
         if known:
             yield f"{known}: takes the levels of its own residuals as known."
-    elif levelled:
+    exact = _labels(one for one in fits if one.exact)
+    if exact:
+        yield (
+            f"{exact}: meets every reading but for round-off. The readings show no noise, so there"
+            " are no standard errors, no outliers and no search for other answers; state the noise"
+            " that instruments have, as in noise.deviation=0.1."
+        )
+    elif levelled and not any(one.levels for one in fits):
         yield (
             "The noise level is estimated from the residuals. Standard errors are scaled by it,"
             " intervals use Student's t, and the size of the residuals cannot test the model."

@@ -1,0 +1,55 @@
+"""Readings without noise: the first thing that a newcomer tries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ipe_bench as ib
+from ipe_bench.baselines import LevenbergMarquardt
+from ipe_bench.measurements import Formula
+
+LM = {"lm": LevenbergMarquardt()}
+X = tuple(float(k) for k in range(20))
+
+
+def answered(expression, start, z):
+    return ib.estimate(Formula(expression, start, {"x": X}), np.asarray(z), LM)
+
+
+@pytest.mark.parametrize(
+    ("expression", "z", "right"),
+    [
+        ("a*x+b", [2 * k + 1 for k in range(20)], [2, 1]),
+        ("a*x+b", [round(0.3 + 0.1 * k, 1) for k in range(20)], [0.1, 0.3]),
+        ("a*x+b", [3.0] * 20, [0, 3]),
+        ("a*exp(-b*x/10)", 2 * np.exp(-0.07 * np.array(X)), [2, 0.7]),
+        ("sin(a*x/10)+1000*b", np.sin(0.13 * np.array(X)) + 1e3, [1.3, 1]),
+        ("a*log(b+x)", 2 * np.log(3 + np.array(X)), [2, 3]),
+    ],
+    ids=["integers", "tenths", "equal", "decay", "sine on a large offset", "logarithm"],
+)
+def test_exact_readings_have_an_exact_answer(expression, z, right):
+    answer = answered(expression, {"a": 1.0, "b": 1.0}, z)
+    (one,) = answer
+    assert one.x == pytest.approx(right, rel=1e-9, abs=1e-12)
+    assert np.isnan(one.standard_errors).all()
+    assert not one.outliers.any()
+    assert answer.examination is None
+    assert answer.passes
+    assert "which meets every reading exactly" in answer.finding()
+    assert "The readings show no noise, so there are no standard errors" in str(answer)
+
+
+def test_readings_that_are_exact_but_for_one_are_not():
+    z = 2 * np.array(X) + 1
+    z[7] += 1e-6
+    (one,) = answered("a*x+b", {"a": 1.0, "b": 1.0}, z)
+    assert not one.exact
+    assert np.flatnonzero(one.outliers).tolist() == [7]
+
+
+def test_as_many_readings_as_parameters_are_no_exact_data():
+    model = Formula("a*x+b", {"a": 1.0, "b": 1.0}, {"x": (0.0, 1.0)})
+    (one,) = ib.estimate(model, np.array([1.0, 3.0]), LM)
+    assert not one.exact
