@@ -226,11 +226,6 @@ def test_without_trackers_they_are_those_of_the_command(monkeypatch, find):
         ((np.full(40, np.inf),), {}, "inf is not a reading"),
         ((np.full(40, 1j),), {}, "are complex; give real numbers"),
         ((np.zeros(40),), {"noise": 0.1}, "noise: 0.1 is none; give one such as ib.noise"),
-        (
-            (np.zeros(40),),
-            {"noise": ib.noise.Unknown()},
-            "noise: is not given and cannot be estimated",
-        ),
     ],
 )
 def test_mistakes_in_an_estimate_are_one_line(polynomial, arguments, options, words):
