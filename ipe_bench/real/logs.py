@@ -21,7 +21,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.real.readings import TextTable, read_tables, unit_of
 from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel, require_parts
-from ipe_bench.states.copies import SURE, copy_p
+from ipe_bench.states.copies import SURE
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.lost import why_lost
 from ipe_bench.states.particles import Bootstrap
@@ -290,7 +290,8 @@ class LogTracks:
     found: str = ""
     """The verdict on the search for them; empty if one maximum was found."""
     notes: Sequence[str] = ()
-    """Other maxima that the searches have found, and copies of the path that fit."""
+    """Constants that are held at 0, other maxima that the searches have found, and a second path that
+    fits."""
 
     @classmethod
     def of(cls, log: Log, label: str, tracker: Tracker) -> LogTracks:
@@ -339,7 +340,7 @@ class LogTracks:
             lost_from=lost_from,
             effective=effective,
             smooths=tracker.smooths,
-            notes=[*_copies(log, tracks), *_second(log, tracks)],
+            notes=_second(log, tracks),
         )
 
     @property
@@ -361,19 +362,6 @@ class LogTracks:
         if self.mean_nis > high:
             return OVERCONFIDENT
         return TOO_CAUTIOUS if self.mean_nis < low else CONSISTENT
-
-
-def _copies(log: Log, tracks: Tracks) -> list[str]:
-    """Words that copies of the path by whole periods of a state fit as well, if they do."""
-    p = copy_p(log.model, log.z[None], tracks)
-    if p is None or not p[0] < SURE:
-        return []
-    periods = zip(log.model.states, log.model.state_periods, strict=True)
-    names = " or ".join(state.name for state, period in periods if period)
-    return [
-        f"AMBIGUOUS: the path is right with a probability of {p[0]:.2g} among its copies, in which"
-        f" {names} is shifted by whole periods"
-    ]
 
 
 def _second(log: Log, tracks: Tracks) -> list[str]:

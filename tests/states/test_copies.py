@@ -104,14 +104,11 @@ def test_what_has_no_copies_has_no_probability_of_them():
     assert np.isfinite(p).tolist() == [True, False]
 
 
-def test_a_log_is_called_ambiguous_where_its_copies_fit():
+def test_a_log_whose_copies_are_turns_of_one_angle_is_not_ambiguous():
+    """A copy is the same angle at every epoch, whatever the prior says of its turns."""
     smoother, z = Smoother(ekf()), np.array([[0.2]])
-    sure = LogTracks.of(Log(replace(COMPASS, spread={"angle": 0.1}), z), "ekf_rts", smoother)
-    assert not sure.notes
-    (note,) = LogTracks.of(Log(COMPASS, z), "ekf_rts", smoother).notes
-    density = np.exp(-((0.2 + TURN * np.arange(-30, 31)) ** 2) / 32.0)
-    p = density[30] / density.sum()
-    assert note.startswith(f"AMBIGUOUS: the path is right with a probability of {p:.2g} among")
+    assert copy_p(COMPASS, z[None], smoother.track(COMPASS, z[None]))[0] < SURE
+    assert not LogTracks.of(Log(COMPASS, z), "ekf_rts", smoother).notes
 
 
 def test_states_in_rad_have_a_period_in_every_model_of_ours():
