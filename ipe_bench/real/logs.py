@@ -290,8 +290,8 @@ class LogTracks:
     found: str = ""
     """The verdict on the search for them; empty if one maximum was found."""
     notes: Sequence[str] = ()
-    """Constants that are held at 0, other maxima that the searches have found, and a second path that
-    fits."""
+    """Constants that are held at 0, other maxima that the searches have found, and a second path
+    that fits."""
 
     @classmethod
     def of(cls, log: Log, label: str, tracker: Tracker) -> LogTracks:
