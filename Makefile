@@ -81,14 +81,14 @@ bench: .venv/ready
 # The documentation, in outputs/docs/html. Its gallery is drawn from what is stored of the experiments.
 docs: .venv/ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[docs]"
-	$(BIN)/python tests/site/make_docs.py outputs/docs
+	PYTHONPATH=tests $(BIN)/python tests/site/make_docs.py outputs/docs
 
 # Draws the gallery's pages again, in outputs/docs/source/gallery, and README's table and pictures, and says what is stored
 # of each experiment, in seconds.
 # NAMES="headline paper" computes these anew and stores them, with their own trials: `filters`, `beyond` and `states` take
 # the better part of an hour. TRIALS=100 takes a tenth of the trials, which their pages then say.
 gallery: .venv/ready
-	$(BIN)/python tests/site/make_docs.py outputs/docs --store $(NAMES) $(if $(TRIALS),--trials $(TRIALS))
+	PYTHONPATH=tests $(BIN)/python tests/site/make_docs.py outputs/docs --store $(NAMES) $(if $(TRIALS),--trials $(TRIALS))
 
 .venv/ready: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \

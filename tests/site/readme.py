@@ -87,7 +87,7 @@ def save(view: View, path: Path, *, dark: bool = False) -> None:
     """Saves the picture in few colours, which take a third of the room."""
     from PIL import Image
 
-    picture(view, dark=dark).savefig(path)
+    picture(view, dark=dark).savefig(path, dpi="figure")
     with Image.open(path) as image:
         few = image.convert("RGB").quantize(_COLORS, dither=Image.Dither.NONE)
     few.save(path, optimize=True)
