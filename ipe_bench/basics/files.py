@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import StorageError
+from ipe_bench.basics.visible import visible
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
@@ -54,6 +55,14 @@ def regular(path: Path) -> Path:
     return path
 
 
+def fault_of(path: Path) -> str:
+    """Says why a path is no file that can be read; empty if it is one."""
+    if path.is_file():
+        return ""
+    kind = "is a folder" if path.is_dir() else "is no regular file"
+    return f"{kind}; name a file" if os.path.lexists(path) else "there is no such file"
+
+
 def make_folder(path: Path) -> None:
     """Makes sure that there is such a folder.
 
@@ -69,8 +78,10 @@ def make_folder(path: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a text file in one piece; see `write_atomically`."""
-    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    """Writes a text file in one piece, without control characters and with the bytes of names that
+    are no UTF-8 written out; see `write_atomically`."""
+    content = visible(text).encode("utf-8", "backslashreplace")
+    write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

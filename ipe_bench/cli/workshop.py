@@ -90,6 +90,8 @@ def new_command(kind: str, name: str | None, language: str | None = None) -> int
     if kind == "ci" and name is None:
         print(write_ci())
         return 0
+    if kind == "ci":
+        raise UserError(f"new ci: takes no name; leave out {name}")
     if name is None:
         raise UserError("new: the following arguments are required: NAME")
     if language is not None and kind == "skill":

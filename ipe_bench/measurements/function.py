@@ -108,9 +108,12 @@ class Function(WrittenModel):
         path."""
         module, colon, name = self.of.partition(":")
         module = module.removesuffix(".py")
-        if not (module and colon and name.isidentifier()):
+        parts = module.split(".")
+        if not (all(map(str.isidentifier, parts)) and colon and name.isidentifier()):
             example = "such as swing:angle for the function angle of swing.py"
-            raise UserError(f"of={self.of}: give MODULE:FUNCTION, {example}")
+            raise UserError(
+                f"of={self.of}: give MODULE:FUNCTION, {example}, without the folder of the file"
+            )
         try:
             if os.getcwd() not in sys.path:  # worker processes take over the path
                 sys.path.insert(0, os.getcwd())

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, did_you_mean, unknown
-from ipe_bench.basics.files import write_text
+from ipe_bench.basics.files import fault_of, write_text
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement, labels, with_unit
 from ipe_bench.measurements.joint import Joint
@@ -182,8 +182,9 @@ def _read_table(path: Path) -> TextTable:
     header."""
     if path.parent == _SAMPLES and not path.is_file():
         path = Path(__file__).with_name("samples") / path.name
-    if not path.is_file():
-        raise TextTable(path).error("there is no such file")
+    fault = fault_of(path)
+    if fault:
+        raise TextTable(path).error(fault)
     data = path.read_bytes()
     table = TextTable(path, digest=hashlib.sha256(data).hexdigest())
     table = (_with_parquet if path.suffix == ".parquet" else _with_text)(table, data)

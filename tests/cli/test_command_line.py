@@ -92,6 +92,7 @@ MISTAKES = {
         ["new", "solver", "con"],
         "con: is no name of a folder on Windows; choose another name",
     ),
+    "a guard with a name": (["new", "ci", "mine"], "new ci: takes no name; leave out mine"),
     "word too few": (["new", "solver"], "new: the following arguments are required: NAME"),
     "no data set": (
         ["run", "measurement=nist/boxbot"],

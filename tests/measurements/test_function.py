@@ -225,6 +225,8 @@ def test_readings_of_a_file_give_the_parameters_back(laws):
     ("of", "options", "said"),
     [
         ("some_laws", {}, "give MODULE:FUNCTION"),
+        ("../laws:f", {}, "give MODULE:FUNCTION"),
+        ("x/laws:f", {}, "without the folder of the file"),
         ("nowhere:h", {}, "there is no module nowhere here"),
         ("some_laws:swung", {}, "did you mean swing?"),
         ("some_laws:no_parameter", {}, "has no parameter"),

@@ -786,8 +786,10 @@ CHANGES = {
     "estimate-passes": Change(
         "cli",
         "estimate exits with 0 though no fit passes",
-        "say_files(files)\n    return 0 if answer.passes else 1",
-        "say_files(files)\n    return 0",
+        "has the numbers\n    say_files([stored, *write_page(folder, answer, provenance,"
+        " figures=drawn)])\n    return 0 if answer.passes else 1",
+        "has the numbers\n    say_files([stored, *write_page(folder, answer, provenance,"
+        " figures=drawn)])\n    return 0",
         "test_estimate.py",
     ),
     "figures-drawn": Change(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 from shared.reports import HOSTILE, fill
 from shared.synthetic_store import Synthetic
 
 from ipe_bench.api import report as write_report
+from ipe_bench.report.tables.table import csv_text
 
 pytestmark = pytest.mark.browser
 
@@ -300,3 +303,12 @@ def test_it_prints_and_the_answer_on_a_few_pages(browser, page_file, desktop):
         assert desktop.run("document.documentElement.scrollWidth") <= (210 - 24) / 25.4 * 96 + 1
     finally:
         desktop.call("Emulation.setEmulatedMedia", media="")
+
+
+def test_a_spreadsheet_computes_no_name_of_a_csv_file():
+    hostile = ["=HYPERLINK(1)", "+1+cmd|' /C calc'!A0", "@SUM(A1)", "-x", "-1+cmd|'x'!A"]
+    plain = ["-", "-inf", "-1.5", "+19 % (9.6 to 29)", "newton", "-3.2 to 5", "-1e-05"]
+    frame = pd.DataFrame({"=name": [*hostile, *plain], "number": np.arange(12.0) - 5})
+    read = pd.read_csv(io.StringIO(csv_text(frame)), dtype=str, keep_default_na=False)
+    assert read["'=name"].tolist() == [*(f"'{name}" for name in hostile), *plain]
+    assert read["number"].astype(float).tolist() == frame["number"].tolist()

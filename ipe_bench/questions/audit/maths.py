@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
 from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.files import fault_of
 from ipe_bench.basics.linalg import Array, finite
 from ipe_bench.statistics.comparisons import ALPHA, holm
 from ipe_bench.statistics.intervals import rms_interval
@@ -515,8 +516,9 @@ def _require_positive(correlation: Array, rows: NDArray[np.intp], name: str) -> 
 def _read(path: Path) -> pd.DataFrame:
     import pandas as pd
 
-    if not path.is_file():
-        raise UserError(f"{path}: there is no such file")
+    fault = fault_of(path)
+    if fault:
+        raise UserError(f"{path}: {fault}")
     try:
         if path.suffix == ".parquet":
             return pd.read_parquet(path)

@@ -16,7 +16,7 @@ from ipe_bench.basics.files import regular, write_json, write_text
 from ipe_bench.plugins.extensions import files_of_records, use_statistics
 from ipe_bench.report.formats import FIGURES, PAGE
 from ipe_bench.report.style import Which, file_formats, which_figures
-from ipe_bench.report.tables.table import Part, Shown, Strong, Table
+from ipe_bench.report.tables.table import Part, Shown, Strong, Table, csv_text
 from ipe_bench.runs.store import Store
 
 if TYPE_CHECKING:
@@ -137,9 +137,9 @@ def _write_summaries(summary: pd.DataFrame, output: Path) -> list[Path]:
     main = main_columns(summary)
     is_total = main["parameter"] == ALL
     files = [output / "summary_all.csv", output / "parameters.csv"]
-    write_text(output / "summary.csv", main[is_total].to_csv(index=False))
-    write_text(files[0], summary.to_csv(index=False))
-    write_text(files[1], main[~is_total].to_csv(index=False))
+    write_text(output / "summary.csv", csv_text(main[is_total]))
+    write_text(files[0], csv_text(summary))
+    write_text(files[1], csv_text(main[~is_total]))
     return files
 
 
@@ -152,7 +152,7 @@ def _write_curves(analysis: Analysis, folder: Path) -> list[Path]:
         frame = getattr(analysis, name)
         if len(frame):
             files.append(folder / f"{name}.csv")
-            write_text(files[-1], frame.to_csv(index=False))
+            write_text(files[-1], csv_text(frame))
     return files
 
 

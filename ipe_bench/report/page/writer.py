@@ -19,7 +19,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import regular, write_json, write_text
 from ipe_bench.report.formats import PAGE
 from ipe_bench.report.style import house_style
-from ipe_bench.report.tables.table import Part, Table, environment
+from ipe_bench.report.tables.table import Part, Table, csv_text, environment
 from ipe_bench.report.words import CITATION, public
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def write_files(
     `name`.html with at most three sentences and the first of its tables seen at once, and its
     figures."""
     files = [folder / table[0], folder / f"{name}.html"]
-    write_text(files[0], table[1].to_csv(index=False))
+    write_text(files[0], csv_text(table[1]))
     with house_style() if drawings else nullcontext():
         figures = [drawing.drawn(folder, (PAGE,)) for drawing in drawings]
     rest = list(parts)

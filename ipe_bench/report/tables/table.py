@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 LONG = 45
 """Number of rows from which a LaTeX table runs over pages."""
+_FORMULA = re.compile(r"[=@]|[+-](?!inf\b)[^\d\s.]|[+-].*([|!]|\w\()")
+"""Texts that a spreadsheet computes, unlike signed numbers."""
 MOST_ROWS = 400
 """Largest number of rows of a table on an HTML page."""
 COLUMN = 3.5
@@ -410,7 +412,22 @@ def comma_separated(table: Table) -> str:
     if data is None:
         titles = [column.title for column in table.columns]
         data = pd.DataFrame([[cell.text for cell in row] for row in table.rows], columns=titles)
-    return data.to_csv(index=False)
+    return csv_text(data)
+
+
+def csv_text(data: pd.DataFrame) -> str:
+    """Writes a frame as CSV; a text that a spreadsheet would compute begins with an apostrophe."""
+    from pandas.api.types import is_numeric_dtype
+
+    safe = data.rename(columns=_no_formula)
+    for place, kind in enumerate(data.dtypes):
+        if not is_numeric_dtype(kind):
+            safe.isetitem(place, [_no_formula(cell) for cell in data.iloc[:, place]])
+    return safe.to_csv(index=False)
+
+
+def _no_formula(cell: Any) -> Any:
+    return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
 
 
 def markdown(table: Table) -> str:
