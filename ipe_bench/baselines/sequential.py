@@ -19,9 +19,8 @@ from ipe_bench.basics.options import NonNegative, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.states.base import Normal
-from ipe_bench.states.linearisation import Rule
-from ipe_bench.states.trackers import update
+from ipe_bench.states.algebra import factor, lower_solve, symmetric, transposed, upper_solve
+from ipe_bench.states.linearisation import Affine, Rule
 
 LARGEST = 1e150
 """The largest number that a filter takes in, so that its square exists."""
@@ -221,20 +220,41 @@ class _Stack(_Filters):
             # Each linearisation updates the prediction anew, about the last estimate.
             readings = _TurnedReadings(self, epoch, at, P[at])
             read = rule.linearise(readings, before, self.P[at])
-            R = np.eye(read.b.shape[-1])
-            found = update(Normal(x[at], P[at]), read, R, readings.z)
-            self.x[at] = found.x.mean
-            self.P[at] = found.x.covariance
+            self.x[at], self.P[at], nis = _updated(x[at], P[at], read, readings.z)
             if iteration == 0:
                 # The innovation of the prediction; later ones have seen z.
-                self.nis[at] += found.nis
-            lost = ~finite(found.x.mean)
+                self.nis[at] += nis
+            lost = ~finite(self.x[at])
             singular = lost & (self.status[at] == Status.RUNNING)
             self.end(at[singular], Status.SINGULAR, f"S is singular at epoch {epoch.number}")
             change = (np.abs(self.x[at] - before) / deviations(self.P[at])).max(axis=1)
             at = at[~(lost | (change <= tolerance))]
             if not len(at):
                 return
+
+
+def _updated(x: Array, P: Array, read: Affine, z: Array) -> tuple[Array, Array, Array]:
+    """Takes in white readings z = H x + b + e + v (trials, m), e ~ N(0, W) of the rule, and returns
+    mean, covariance and NIS:
+
+        y = z - H x - b,   S = H P H' + W + I,   K = P H' S^-1
+        x <- x + K y
+        P <- (I - K H) P (I - K H)' + K (W + I) K'
+
+    This form of P, Joseph's, stays positive definite.
+    """
+    H = read.A
+    y = z - multiply(H, x) - read.b
+    noise = read.W + np.eye(y.shape[1])
+    PH = np.matmul(P, transposed(H))
+    # S = L L', K' = L^-T L^-1 (P H')'
+    L = factor(np.matmul(H, PH) + noise)
+    K = transposed(upper_solve(L, lower_solve(L, transposed(PH))))
+    rest = np.eye(x.shape[1]) - np.matmul(K, H)
+    unread = np.matmul(np.matmul(rest, P), transposed(rest))
+    added = np.matmul(np.matmul(K, noise), transposed(K))
+    e = lower_solve(L, y[..., None])[..., 0]
+    return x + multiply(K, y), symmetric(unread + added), np.sum(e**2, axis=1)
 
 
 class _TurnedReadings:

@@ -27,7 +27,7 @@ from llvmlite import ir
 
 from ipe_bench.engine.chains import ChainSize, Epoch
 from ipe_bench.engine.plan import StepPlan
-from ipe_bench.engine.points import PointSize
+from ipe_bench.engine.scan import Step
 from ipe_bench.engine.trace import Program, RowPrograms
 
 F64, I32, I64, PTR, VOID = (
@@ -108,24 +108,62 @@ def rows(source: RowPrograms, width: int) -> str:
     return str(made.module)
 
 
+def scan(step: Step, program: Program, width: int) -> str:
+    """Writes what `engine.scan` describes; a lane is a trial."""
+    arguments = ir.FunctionType(VOID, [PTR] * 4 + [I64] * 5)
+    made: Any = ir.Function(ir.Module("scan"), arguments, "scan")
+    carry, each, shared, out, trials, first, by, count, length = made.args
+    b: Any = ir.IRBuilder(made.append_basic_block())
+    v = _Blocks(b, width)
+    lanes = [ir.Constant(I32, i) for i in range(width)]
+    sizes = (step.carried, step.each, step.shown)
+    kept, given, shown = (room(b, v.type, max(size, 1), 8 * width) for size in sizes)
+
+    def row(array: Value, index: Value, size: int) -> Value:
+        return b.gep(array, [b.mul(index, integer(size))], source_etype=F64)
+
+    def gather(rows: list[Value], frame: Value, size: int) -> None:
+        with loop(b, integer(0), integer(size)) as j:
+            vector = ir.Constant(v.type, ir.Undefined)
+            for lane, begin in zip(lanes, rows, strict=True):
+                vector = b.insert_element(vector, number_at(b, begin, j), lane)
+            v.store([vector], v.place(frame, j), [0])
+
+    def scatter(frame: Value, rows: list[Value], size: int) -> None:
+        with loop(b, integer(0), integer(size)) as j:
+            (vector,) = v.load(frame, [j])
+            for lane, begin in zip(lanes, rows, strict=True):
+                put(b, b.extract_element(vector, lane), begin, j)
+
+    with loop(b, integer(0), trials, width) as group:
+        last = b.sub(trials, integer(1))
+        own = [b.add(group, integer(i)) for i in range(width)]
+        # A group that is not full repeats the last trial.
+        own = [b.select(b.icmp_signed("<", one, last), one, last) for one in own]
+        begins = [row(carry, one, step.carried) for one in own]
+        gather(begins, kept, step.carried)
+        with loop(b, integer(0), count) as i:
+            k = b.add(first, b.mul(by, i))
+            places = [b.add(b.mul(one, length), k) for one in own]
+            gather([row(each, place, step.stride) for place in places], given, step.each)
+            epoch = row(shared, k, step.shared)
+            numbers = [v.spread(number_at(b, epoch, integer(j))) for j in range(step.shared)]
+            inputs = [*v.load(kept, range(step.carried)), *v.load(given, range(step.each))]
+            found = v.run(program, [*inputs, *numbers])
+            v.store(found[: step.carried], kept, range(step.carried))
+            v.store(found[step.carried :], shown, range(step.shown))
+            scatter(shown, [row(out, place, step.shown) for place in places], step.shown)
+        scatter(kept, begins, step.carried)
+    b.ret_void()
+    return str(made.module)
+
+
 def chains(size: ChainSize, width: int) -> str:
     """Writes void chains(double *A, double *B, double *D, double *G, double *a, double *v, double
     *x, double *P, double *crossed, int64 trials, int64 epochs, double *frame), which
     `engine.chains` describes; null is what is not asked for. A lane is a trial; a group that is not
     full repeats its last one."""
     return str(_ChainWriter(size, width).module)
-
-
-def spreads(size: PointSize, width: int) -> str:
-    """Writes void spreads(double *m, double *P, double *s, double *L, double *x, int64 trials,
-    int64 points, double *frame), which `engine.points` describes; a lane is a trial."""
-    return str(_SpreadWriter(size, width).module)
-
-
-def regressions(size: PointSize, width: int) -> str:
-    """Writes void regressions(double *L, double *s, double *w, double *c, double *y, double *mean,
-    double *M, double *A, double *W, int64 trials, int64 points, double *frame), likewise."""
-    return str(_RegressionWriter(size, width).module)
 
 
 @dataclass(frozen=True)
@@ -216,21 +254,6 @@ class _LaneWriter:
 
     def _lanes(self, begin: Value) -> _Lanes:
         return _Lanes(self.v, begin, self.n)
-
-    def _number(self, array: Value, place: Value) -> Value:
-        """Returns a number of an array in all lanes."""
-        return self.v.spread(number_at(self.b, array, place))
-
-    @contextmanager
-    def _directions(self, s: Value, i: Value) -> Iterator[tuple[Value, Value]]:
-        """Writes a loop over the directions in which point i of s (points, n) does not lie at 0:
-        one of sigma points at most."""
-        b = self.b
-        with self._each(self.n) as j:
-            place = b.add(b.mul(i, integer(self.n)), j)
-            share = number_at(b, s, place)
-            with b.if_then(b.fcmp_unordered("!=", share, ir.Constant(F64, 0.0))):
-                yield j, self.v.spread(share)
 
     def _each(self, count: int | Value) -> Any:
         count = integer(count) if isinstance(count, int) else count
@@ -585,130 +608,6 @@ class _ChainWriter(_LaneWriter):
         """Writes to <- to + share row."""
         with self._each(self.n) as i:
             to[i] = self.v.call("fma", share, row[i], to[i])
-
-
-class _SpreadWriter(_LaneWriter):
-    """Writes the points x = m + L s of covariances L L'."""
-
-    def __init__(self, size: PointSize, width: int) -> None:
-        super().__init__("spreads", size.n, pointers=5, numbers=1, width=width)
-        parts = self._parts(self.frame, size.spread)
-        self.mean, self.P, self.L, self.x = map(self._lanes, parts[:-1])
-        self._write(self._solve)
-
-    def _solve(self) -> None:
-        m, P, s, L, x = self.arrays
-        (points,) = self.numbers
-        square = self.n**2
-        zero = integer(0)
-        one = integer(1)
-        self._take(m, self.mean, self.n, zero, one)
-        self._take(P, self.P, square, zero, one)
-        self._factor()
-        self._give(self.L, L, square, zero, one)
-        with self._each(points) as i:
-            self.x.keep(self.mean.all())
-            with self._directions(s, i) as (j, share), loop(self.b, j, integer(self.n)) as r:
-                self.x[r] = self.v.call("fma", self.L.row(r)[j], share, self.x[r])
-            self._give(self.x, x, self.n, i, points)
-
-    def _factor(self) -> None:
-        """Writes L_ij L_jj = P_ij - sum_{k<j} L_ik L_jk, column by column."""
-        b = self.b
-        n = integer(self.n)
-        with self._each(self.n**2) as i:
-            self.L[i] = self.zero
-        with self._each(self.n) as j:
-            # What is not written yet is 0.
-            before = self.L.row(j).all()
-            pivot = b.fsub(self.P.row(j)[j], self._dot(before, before))
-            root = self.v.call("sqrt", pivot)
-            self.L.row(j)[j] = root
-            with loop(b, b.add(j, integer(1)), n) as i:
-                along = self._dot(self.L.row(i).all(), before)
-                rest = b.fsub(self.P.row(i)[j], along)
-                self.L.row(i)[j] = b.fdiv(rest, root)
-
-
-class _RegressionWriter(_LaneWriter):
-    """Writes the affine law of values y at such points."""
-
-    def __init__(self, size: PointSize, width: int) -> None:
-        super().__init__("regressions", size.n, pointers=9, numbers=1, width=width)
-        self.m = size.m
-        L, M, A, W, mean, y, _ = self._parts(self.frame, size.regression)
-        self.L = self._lanes(L)
-        self.M = self._lanes(M)
-        self.A = self._lanes(A)
-        self.W = _Lanes(self.v, W, self.m)
-        self.mean = _Lanes(self.v, mean, self.m)
-        self.y = _Lanes(self.v, y, self.m)
-        self._write(self._solve)
-
-    def _solve(self) -> None:
-        L, s, w, c, y, *results = self.arrays
-        (points,) = self.numbers
-        across = self.m * self.n
-        sizes = (self.m, across, across, self.m**2)
-        zero = integer(0)
-        one = integer(1)
-        self._take(L, self.L, self.n**2, zero, one)
-        for lanes, count in zip((self.mean, self.M, self.A, self.W), sizes, strict=True):
-            with self._each(count) as i:
-                lanes[i] = self.zero
-        # The mean, sum w y.
-        with self._each(points) as i:
-            self._take(y, self.y, self.m, i, points)
-            weight = self._number(w, i)
-            with self._each(self.m) as j:
-                self.mean[j] = self.v.call("fma", weight, self.y[j], self.mean[j])
-        with self._each(points) as i:
-            self._take(y, self.y, self.m, i, points)
-            self._add_point(self._number(c, i), s, i)
-        self._divide()
-        with self._each(self.m) as j:
-            self._finish(j)
-        for lanes, array, count in zip(
-            (self.mean, self.M, self.A, self.W), results, sizes, strict=True
-        ):
-            self._give(lanes, array, count, zero, one)
-
-    def _add_point(self, weight: Value, s: Value, i: Value) -> None:
-        """Writes M <- M + c d s' and W <- W + c d d' for the values y of point i, d = y - mean."""
-        b = self.b
-        with self._each(self.m) as j:
-            self.y[j] = b.fsub(self.y[j], self.mean[j])
-        with self._directions(s, i) as (k, share), self._each(self.m) as j:
-            row = self.M.row(j)
-            row[k] = self.v.call("fma", b.fmul(weight, self.y[j]), share, row[k])
-        with self._each(self.m) as j:
-            d = b.fmul(weight, self.y[j])
-            across = self.W.row(j)
-            with loop(b, integer(0), b.add(j, integer(1))) as k:
-                across[k] = self.v.call("fma", d, self.y[k], across[k])
-
-    def _divide(self) -> None:
-        """Writes A with A L = M, from the last column to the first; its rows do not wait for each
-        other."""
-        b = self.b
-        with self._down(integer(self.n)) as i:
-            column = self.L.column(i)
-            pivot = self.L.row(i)[i]
-            with self._each(self.m) as j:
-                # What is not written yet is 0.
-                A = self.A.row(j)
-                rest = b.fsub(self.M.row(j)[i], self._dot(column, A.all()))
-                A[i] = b.fdiv(rest, pivot)
-
-    def _finish(self, j: Value) -> None:
-        """Writes row j of W - M M'."""
-        b = self.b
-        row = self.M.row(j).all()
-        with loop(b, integer(0), b.add(j, integer(1))) as i:
-            explained = self._dot(row, self.M.row(i).all())
-            left = b.fsub(self.W.row(j)[i], explained)
-            self.W.row(j)[i] = left
-            self.W.row(i)[j] = left
 
 
 class _Writer:
@@ -1120,6 +1019,89 @@ class _Vectors:
         return module.globals.get(name) or ir.Function(
             module, ir.FunctionType(kind, [kind] * count), name
         )
+
+
+class _Blocks(_Vectors):
+    """Writes operations on matrices, too, which lie in memory in rows."""
+
+    def apply(self, name: str, *args: Value) -> Value:
+        match name.split():
+            case ["part", place]:
+                return self.load(args[0], [int(place)])[0]
+            case ["product", *sizes]:
+                return self._product(args, *map(int, sizes))
+            case ["orthogonalised", n, columns, checked, small]:
+                return self._orthogonalised(args, int(n), int(columns), int(checked), float(small))
+        return super().apply(name, *args)
+
+    def _room(self, count: int) -> Value:
+        with self.builder.goto_entry_block():
+            return room(self.builder, self.type, count, 8 * self.width)
+
+    def _filled(self, values: Sequence[Value]) -> Value:
+        frame = self._room(len(values))
+        self.store(values, frame, range(len(values)))
+        return frame
+
+    def _row(self, frame: Value, i: Value, columns: int) -> Value:
+        return self.place(frame, self.builder.mul(i, integer(columns)))
+
+    def _dot(self, one: Sequence[Value], other: Sequence[Value]) -> Value:
+        """Computes a sum of products by four sums, of which none waits for another."""
+        sums = [self.constant(0.0)] * 4
+        for i, (a, c) in enumerate(zip(one, other, strict=True)):
+            sums[i % 4] = self.call("fma", a, c, sums[i % 4])
+        add = self.builder.fadd
+        return add(add(sums[0], sums[1]), add(sums[2], sums[3]))
+
+    def _product(self, args: Sequence[Value], n: int, inner: int, columns: int) -> Value:
+        b = self.builder
+        A = self._filled(args[: n * inner])
+        B = self._filled(args[n * inner :])
+        C = self._room(n * columns)
+        with loop(b, integer(0), integer(n)) as i:
+            row = self.load(self._row(A, i, inner), range(inner))
+            to = self._row(C, i, columns)
+            with loop(b, integer(0), integer(columns)) as j:
+                column = self.load(self.place(B, j), range(0, inner * columns, columns))
+                self.store([self._dot(row, column)], self.place(to, j), [0])
+        return C
+
+    def _orthogonalised(
+        self, args: Sequence[Value], n: int, columns: int, checked: int, small: float
+    ) -> Value:
+        b = self.builder
+        zero = self.constant(0.0)
+        one = self.constant(1.0)
+        W = self._filled(args)
+        F = self._room(n * n)
+        least = self._filled([zero] * n)
+        with loop(b, integer(0), integer(checked)) as i:
+            row = self.load(self._row(W, i, columns), range(columns))
+            part = b.fmul(self._dot(row, row), self.constant(small**2))
+            self.store([part], self.place(least, i), [0])
+        with loop(b, integer(0), integer(n)) as i:
+            begin = self._row(W, i, columns)
+            row = self.load(begin, range(columns))
+            square = self._dot(row, row)
+            limit = self.load(least, [i])[0]
+            square = b.select(b.fcmp_ordered("<=", square, limit), zero, square)
+            none = b.fcmp_ordered("<=", square, zero)
+            length = self.call("sqrt", square)
+            inverse = b.fdiv(b.select(none, zero, one), b.select(none, one, length))
+            direction = [b.fmul(a, inverse) for a in row]
+            self.store(direction, begin, range(columns))
+            self.store([length], self.place(F, b.mul(i, integer(n + 1))), [0])
+            with loop(b, b.add(i, integer(1)), integer(n)) as j:
+                at = self._row(W, j, columns)
+                direction = self.load(begin, range(columns))
+                other = self.load(at, range(columns))
+                share = self._dot(other, direction)
+                negative = b.fneg(share)
+                pairs = zip(direction, other, strict=True)
+                self.store([self.call("fma", negative, a, c) for a, c in pairs], at, range(columns))
+                self.store([share], self.place(self._row(F, j, n), i), [0])
+        return F
 
 
 @contextmanager

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     # Imported where something is compiled, and here so that results are known to depend on it.
     from ipe_bench.engine import emit as emit
     from ipe_bench.engine.chains import ChainSize
-    from ipe_bench.engine.points import PointSize
 
 _WORTH_THREADS = 40_000
 """Steps times lanes times states from which a second thread gains more than it costs, some 150
@@ -59,7 +58,7 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
 
 def emitted(
     name: str,
-    source: StepPlan | Program | RowPrograms | ChainSize | PointSize,
+    source: StepPlan | Program | RowPrograms | ChainSize,
     width: int,
     arguments: tuple[Any, ...],
 ) -> Callable[..., None]:

@@ -84,6 +84,14 @@ class Graph:
             self._known[key] = Expression(self, operation, operands, len(self._known))
         return self._known[key]
 
+    def block(
+        self, name: str, sizes: Iterable[Any], operands: Sequence[Any], count: int
+    ) -> list[Expression]:
+        """Applies an operation of many operands and `count` results, which is written as loops."""
+        args = [a if isinstance(a, Expression) else self.constant(a) for a in operands]
+        made = self._node(" ".join(map(str, [name, *sizes])), *args)
+        return [self._node(f"part {i}", made) for i in range(count)]
+
     def apply(self, operation: str, *operands: Any) -> Expression:
         """Applies an operation to operands, with constants folded and trivial operations
         dropped."""
@@ -267,7 +275,7 @@ _NUMBERS: dict[str, Callable[..., Any]] = _OPERATORS | {
 _ARRAYS: dict[str, Callable[..., Any]] = _OPERATORS | {
     "less": lambda a, b: np.less(a, b) * 1.0,
     "less_equal": lambda a, b: np.less_equal(a, b) * 1.0,
-    "where": lambda condition, a, b: np.where(condition, a, b)[()],
+    "where": lambda condition, a, b: np.where(condition, a, b) * 1.0,
     "arctan2": np.arctan2,
     "floor": np.floor,
     "remainder": np.remainder,

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, Mask, finite, multiply
+from ipe_bench.engine.chains import lower
 
 _SMALL = 1e-12
 """Pivots, in parts of the variances, below which a covariance counts as singular."""
@@ -87,14 +88,6 @@ class Half(NamedTuple):
     singular: Mask
     """Whether a pivot is as small as round-off (...)."""
 
-    def over(self, B: Array) -> Array:
-        """Computes B G^- (..., r, n) for B (..., r, n)."""
-        X = transposed(upper_solve(self.L, transposed(B)))
-        rows = self.singular
-        if rows.any():
-            X[rows] = np.matmul(B[rows], self.inverse[rows])
-        return X
-
     def whitened(self, B: Array) -> Array:
         """Computes B G^-' (..., r, n) for B (..., r, n)."""
         X = transposed(lower_solve(self.L, transposed(B)))
@@ -121,21 +114,29 @@ def half(P: Array, L: Array | None = None) -> Half:
     return Half(G, L, inverse, singular)
 
 
-def triangular(F: Array) -> Half:
-    """Returns the half F of P = F F' for lower triangular F (trials, n, n), which may be
-    singular."""
+def triangular(P: Array) -> Array:
+    """Computes lower triangular F, F F' = P, of positive semidefinite P (trials, n, n)."""
+    parts = half(P)
+    rows = parts.singular
+    F = parts.G.copy()
+    if rows.any():
+        F[rows] = lower(F[rows])
+    return F
+
+
+def over(X: Array, F: Array) -> Array:
+    """Computes X F^-1 (trials, r, n) for triangular F (trials, n, n), whose pivots count for
+    nothing where they are round-off."""
+    n = F.shape[-1]
+    pivots = np.diagonal(F, axis1=-2, axis2=-1)
     size = np.linalg.norm(F, axis=-1)
-    pivots = np.abs(np.diagonal(F, axis1=-2, axis2=-1))
-    singular = np.asarray(~(pivots > _LOST * size).all(axis=-1))
-    inverse = np.zeros(F.shape)
-    L = F.copy()
-    L[singular] = np.nan
-    usable = singular & finite(F)
-    # F = D C with rows of C of length 1, and F^- = C^+ D^-1.
-    d = np.where(size[usable] > 0, size[usable], 1.0)
-    C = F[usable] / d[..., None]
-    inverse[usable] = np.linalg.pinv(C, rcond=_LOST) / d[:, None]
-    return Half(F, L, inverse, singular)
+    none = np.abs(pivots) <= _LOST * size
+    inverse = np.where(none, 0.0, 1.0) / np.where(none, 1.0, pivots)
+    out = np.empty(X.shape)
+    for j in reversed(range(n)):
+        later = multiply(out[..., j + 1 :], F[..., j + 1 :, j])
+        out[..., j] = (X[..., j] - later) * inverse[..., j, None]
+    return out
 
 
 def principal(P: Array) -> tuple[Array, Array]:

@@ -16,8 +16,7 @@ from ipe_bench.states.base import StateModel
 from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother
 from ipe_bench.states.linearisation import Taylor, Unscented
 from ipe_bench.states.mirrored import in_first_turn, mirrored, ordered, with_second
-from ipe_bench.states.smoothers import smoothed
-from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered
+from ipe_bench.states.trackers import Filter, Tracker, Tracks, passed, smoothed
 from ipe_bench.states.whole_paths import PathDensity
 
 EXTENDED = 1
@@ -63,16 +62,16 @@ class AutoTracker(Tracker):
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         by_state = model.gain_by_state or model.R_by_state
-        first = filtered(model, z, Taylor(), smooths=by_state)
+        tracks, first = passed(model, z, Taylor())
         doubtful = np.flatnonzero(self.descent.improbable(z, first.nis.sum(axis=1)))
         if by_state:
-            return self._likelier(model, z, first, doubtful)
+            return self._likelier(model, z, tracks, first, doubtful)
         density = PathDensity.of(model, z)
-        paths = Descent.of(density, first)
+        paths = Descent.of(density, tracks)
         stage = np.full(len(z), EXTENDED)
         if doubtful.size:
             some = density.subset(doubtful)
-            other = Descent.of(some, filtered(model, some.z, Unscented()))
+            other = Descent.of(some, passed(model, some.z, Unscented())[0])
             stage[doubtful[paths.beaten(other, doubtful)]] = UNSCENTED
             paths = paths.improved(other, doubtful)
         paths = self.descent.descended(density, paths)
@@ -94,17 +93,21 @@ class AutoTracker(Tracker):
         return replace(tracks, stage=stage)
 
     def _likelier(
-        self, model: StateModel, z: Array, first: Tracks, doubtful: NDArray[np.intp]
+        self,
+        model: StateModel,
+        z: Array,
+        tracks: Tracks,
+        first: Tracks,
+        doubtful: NDArray[np.intp],
     ) -> Tracks:
-        """Smooths the filter by tangents, or in doubtful trials that by points if it is
-        likelier."""
-        tracks = smoothed(model, first)
+        """Returns the smoother of the first filter, by tangents, or in doubtful trials that by
+        points if its filter is likelier."""
+        tracks.lose(np.isnan(first.log_likelihood))
         cost = tracks.cost = first.nis.sum(axis=1)
         stage = tracks.stage = np.full(len(z), EXTENDED)
         if not doubtful.size:
             return tracks
-        second = filtered(model, z[doubtful], Unscented(), smooths=True)
-        other = smoothed(model, second)
+        other, second = smoothed(model, z[doubtful], Unscented())
         tracks.calls[doubtful] += second.calls
         likelier = ~(second.log_likelihood <= first.log_likelihood[doubtful])
         rows = doubtful[likelier]

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,6 +53,14 @@ class Paths:
     """The states at the epochs (trials, K, n)."""
     z: Array
     """The readings (trials, K, m)."""
+
+
+class Kept(dict[Any, Any]):
+    """Holds what is made of a model for trackers, and stays behind where that leaves the
+    process."""
+
+    def __reduce__(self) -> tuple[type[Kept], tuple[()]]:
+        return Kept, ()
 
 
 class Fault(NamedTuple):
@@ -200,6 +208,11 @@ class StateModel(Component, ABC):
         """Says how f and h are run that are not recorded, and why."""
         f, h = self.epoch_functions
         return tuple(filter(None, (f.way("transition"), h.way("observe"))))
+
+    @cached_property
+    def passes(self) -> Kept:
+        """What trackers record of the model."""
+        return Kept()
 
     def transition_into(self, k: int) -> Recording:
         """Returns f of the step into epoch k as a function of states (..., n) that knows its

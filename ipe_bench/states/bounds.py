@@ -9,12 +9,10 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.engine.chains import lower, smoothed_chains
-from ipe_bench.states.algebra import factor, half, lower_solve
-from ipe_bench.states.base import Normal, Paths, StateModel
-from ipe_bench.states.linearisation import Affine, Taylor
-from ipe_bench.states.roots import Rooted
-from ipe_bench.states.smoothers import smoothed
-from ipe_bench.states.trackers import Tracks, filtered
+from ipe_bench.states.algebra import factor, half, lower_solve, triangular
+from ipe_bench.states.base import Paths, StateModel
+from ipe_bench.states.linearisation import Taylor
+from ipe_bench.states.trackers import Tracks, filtered, smoothed
 
 
 def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
@@ -30,9 +28,9 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
         UserError: the process noise of a step is singular, and a path has no density; or noise
         depends on the states.
     """
-    x = Rooted.of_normal(Normal(*(part[None] for part in model.prior)))
+    root = triangular(model.prior.covariance[None])[0]
     n = model.n
-    begun = x
+    begun = root
     still = np.zeros((n, n))
     before = paths.start
     forward: list[Array] = []
@@ -50,21 +48,20 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
             # D11 = E F' Q^-1 F is that of the mean F, and what F adds that differs from it: it is
             # as if the states before were read.
             told = _mean_rows(F - F_mean, Q)
-            x = _informed(x, told)
+            root = _informed(root, told)
             if steps:
                 steps[-1] = steps[-1]._replace(told=np.concatenate([steps[-1].told, told]))
             else:
-                begun = x
+                begun = root
             # By Woodbury, D22 - D21 (J + D11)^-1 D12 is the inverse of F P F' + Q.
-            move = Affine(F_mean[None], np.zeros((1, n)), np.zeros((1, n, n)))
-            x = x.moved(move, G[None])
+            root = lower(np.concatenate([F_mean @ root, G], axis=1)[None])[0]
         H, R = _seen(model.observation_at(k).slope(at)[1], R, paths.z[:, k])
         gained = _mean_rows(H, R)
-        x = _informed(x, gained)
+        root = _informed(root, gained)
         steps.append(_Step(F_mean, G, gained))
-        forward.append(x.covariance[0])
+        forward.append(root @ root.T)
         before = at
-    return np.array(forward), _smoothed(begun.root[0], steps)
+    return np.array(forward), _smoothed(begun, steps)
 
 
 class _Step(NamedTuple):
@@ -89,10 +86,15 @@ def _smoothed(start: Array, steps: list[_Step]) -> Array:
     return smoothed_chains(A[None], B[None], G)[0][0, 1:]
 
 
-def _informed(x: Rooted, rows: Array) -> Rooted:
-    """Returns the states whose information has these rows (r, n) beside."""
-    still = np.zeros((1, len(rows)))
-    return x.told(rows[None], still, np.eye(len(rows))[None])[0]
+def _informed(root: Array, rows: Array) -> Array:
+    """Returns a root (n, n) of the covariance of states whose information has these rows (r, n)
+    beside, by orthogonal rows of (I, rows F; 0, F)."""
+    r, n = rows.shape
+    before = np.zeros((1, r + n, r + n))
+    before[0, :r, :r] = np.eye(r)
+    before[0, :r, r:] = rows @ root
+    before[0, r:, r:] = root
+    return lower(before)[0, r:, r:]
 
 
 def _regular(model: StateModel, k: int) -> Array:
@@ -142,5 +144,6 @@ def bound_at_truth(model: StateModel, paths: Paths, smooths: bool = False) -> Ar
     z = np.zeros((*paths.x.shape[:2], model.readings_per_epoch))
     if paths.z.size:
         z[~np.isfinite(paths.z)] = np.nan
-    tracks = filtered(model, z, Taylor(), path=path, smooths=smooths)
-    return (smoothed(model, tracks) if smooths else tracks).covariance
+    if smooths:
+        return smoothed(model, z, Taylor(), path=path)[0].covariance
+    return filtered(model, z, Taylor(), path=path).covariance

@@ -14,12 +14,11 @@ from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Count, Positive, Share, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import normals, own_generators
-from ipe_bench.engine.rows import products
-from ipe_bench.states.algebra import lower_solve, root, transposed
+from ipe_bench.states.algebra import root
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Taylor, Unscented
-from ipe_bench.states.smoothers import path_p
-from ipe_bench.states.trackers import Tracker, Tracks, filtered
+from ipe_bench.states.smoothers import path_p, whole
+from ipe_bench.states.trackers import Tracker, Tracks, passed
 from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 from ipe_bench.states.widened import widened
 
@@ -67,8 +66,8 @@ class Descent:
 
     @classmethod
     def of(cls, density: PathDensity, tracks: Tracks) -> Descent:
-        """Begins at the smoothed paths of a filter's tracks."""
-        at = density.settled(smoothed_path(tracks))
+        """Begins at the paths of a smoother's tracks."""
+        at = density.settled(whole(tracks).mean)
         trials = len(at.x)
         running = np.full(trials, Status.RUNNING, np.int8)
         none = np.zeros(trials, np.int64)
@@ -137,7 +136,7 @@ class LevenbergMarquardtSmoother(Tracker):
     def track(self, model: StateModel, z: Array) -> Tracks:
         density = PathDensity.of(model, z)
         first, other = (
-            Descent.of(density, filtered(model, z, rule)) for rule in (Taylor(), Unscented())
+            Descent.of(density, passed(model, z, rule)[0]) for rule in (Taylor(), Unscented())
         )
         paths = self.descended(density, first.improved(other, np.arange(len(z))))
         return reported(density, self.restarted(density, paths)[0])[0]
@@ -190,7 +189,7 @@ class LevenbergMarquardtSmoother(Tracker):
         trials, starts, n = draws.shape
         one = density.subset(np.repeat(np.arange(trials), starts))
         start = Normal(draws.reshape(-1, n), np.repeat(P[None], len(one.z), axis=0))
-        found = Descent.of(one, filtered(one.model, one.z, Unscented(), start=start))
+        found = Descent.of(one, passed(one.model, one.z, Unscented(), start=start)[0])
         least = found.at.cost.reshape(trials, starts).argmin(axis=1)
         calls = found.calls.reshape(trials, starts).sum(axis=1)
         return replace(take(found, least + starts * np.arange(trials)), calls=calls)
@@ -277,33 +276,6 @@ class LevenbergMarquardtSmoother(Tracker):
             undamped = some.step(about, take(paths.at, rows))
             short[rows] = some.size(about, undamped) <= self.tolerance**2
         return short
-
-
-def smoothed_path(tracks: Tracks) -> Array:
-    """Computes the smoothed means (trials, 1 + K, n) of a filter's tracks from before the first
-    transition, without their covariances: by the scores r of later readings (Bierman, Automatica 9,
-    1973), with those of `Tracks.reads`,
-
-        r <- r + H' S^-1 (y - H P- r),   r <- A' r,   m[k-1] <- m[k-1] + P[k-1] r.
-    """
-    H = np.stack([H for H, _, _ in tracks.reads], axis=1)
-    L = np.stack([L for _, L, _ in tracks.reads], axis=1)
-    # H' S^-1 H = W' W and H' S^-1 y = W' e, with W = L^-1 H and S = L L'.
-    W = lower_solve(L, H)
-    e = np.nan_to_num(tracks.innovations)
-    epochs = len(tracks.reads)
-    r = np.zeros((len(e), 1 + epochs, H.shape[-1]))
-    first = epochs - len(tracks.moves)
-    later = r[:, -1]
-    for k in range(epochs - 1, first - 1, -1):
-        P = tracks.predicted[k - first].covariance
-        left = e[:, k] - multiply(W[:, k], multiply(P, later))
-        later = later + multiply(transposed(W[:, k]), left)
-        later = multiply(transposed(tracks.moves[k - first].A), later)
-        r[:, k] = later
-    start = tracks.start.mean + multiply(tracks.start.covariance, r[:, 0])
-    after = tracks.mean + products(tracks.covariance, r[:, 1:])
-    return np.concatenate([start[:, None], after], axis=1)
 
 
 def reported(density: PathDensity, paths: Descent) -> tuple[Tracks, Array]:

@@ -21,12 +21,15 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply, own
 from ipe_bench.basics.options import Component, Count, Finite, Positive
-from ipe_bench.engine.points import regress, spread_points
 from ipe_bench.functions.judged import by_complex_steps
-from ipe_bench.states.algebra import Half, half, symmetric, transposed, triangular
+from ipe_bench.states.algebra import half, over, symmetric, transposed, triangular
 
 _MOST_POINTS = 100_000
 """Points of a product rule at most."""
+_ROUND_OFF = 1e-14
+"""Variances, in parts of those of the values, that are round-off of a sum over points."""
+_MOST_COLUMNS = 64
+"""Points up to which what they leave is a root of noise."""
 Function = Callable[[Array], Array]
 Nearest = Callable[[Array, Array], Array]
 
@@ -42,25 +45,57 @@ class Affine(NamedTuple):
     """(trials, m, m)"""
 
 
+class Linearised(NamedTuple):
+    """Holds such a law about N(m, F F'), by its mean and by roots."""
+
+    y: Array
+    """A m + b (trials, m)"""
+    AF: Array
+    """(trials, m, n)"""
+    W: Array
+    """(trials, m, m)"""
+    root: Array | None = None
+    """A root (trials, m, r) of W, where the rule knows one."""
+    A: Array | None = None
+    """Slopes (trials, m, n), where the rule knows them."""
+
+    def slopes(self, F: Array) -> Array:
+        return over(self.AF, F) if self.A is None else self.A
+
+    def noise_root(self, N: Array) -> Array:
+        """Returns a root (trials, m, r) of N N' + W, for N (m, q) or (trials, m, q)."""
+        each = np.broadcast_to(N, (*self.y.shape, N.shape[-1]))
+        if self.root is None:
+            W = np.matmul(each, transposed(each)) + self.W
+            # Weights that are negative may leave round-off below 0.
+            size = np.sum(self.AF**2, axis=2)
+            none = np.abs(np.diagonal(W, axis1=1, axis2=2)) <= _ROUND_OFF * size
+            return half(np.where(none[:, None] | none[..., None], 0.0, W)).G
+        return np.concatenate([each, self.root], axis=2)
+
+
 class Rule(Component, ABC):
     """A way to linearise a function about a normal distribution."""
 
-    @abstractmethod
     def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
         """Computes the affine law of g about N(m, P), for m (trials, n) and P (trials, n, n).
         `nearest` shifts values of g that are periodic next to others: the mean of points on both
         sides of a bearing's jump would lie opposite."""
+        F = triangular(P)
+        law = self.linearised(g, m, F, nearest)
+        A = law.slopes(F)
+        return Affine(A, law.y - multiply(A, m), law.W)
 
-    def linearise_by_root(
+    @abstractmethod
+    def linearised(
         self, g: Function, m: Array, F: Array, nearest: Nearest | None = None
-    ) -> Affine:
-        """Computes the affine law of g about N(m, F F'), for a triangular F (trials, n, n) with
-        digits that F F' does not have."""
-        return self.linearise(g, m, np.matmul(F, transposed(F)), nearest)
+    ) -> Linearised:
+        """Computes the affine law of g about N(m, F F') for triangular F (trials, n, n)
+        likewise."""
 
-    def mean(self, g: Function, m: Array, P: Array) -> Array:
-        """Computes the mean (trials, ...) of g over N(m, P), g (trials, p, ...) at points (trials,
-        p, n)."""
+    def mean(self, g: Function, m: Array, F: Array) -> Array:
+        """Computes the mean (trials, ...) of g over N(m, F F'), g (trials, p, ...) at points
+        (trials, p, n)."""
         return g(m)
 
     @abstractmethod
@@ -82,9 +117,12 @@ class Taylor(Rule):
     1.0
     """
 
-    def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
+    def linearised(
+        self, g: Function, m: Array, F: Array, nearest: Nearest | None = None
+    ) -> Linearised:
         y, J = slope(g, m)
-        return Affine(J, y - multiply(J, m), np.zeros((*y.shape, y.shape[-1])))
+        W = np.zeros((*y.shape, y.shape[-1]))
+        return Linearised(y, np.matmul(J, F), W, W[..., :0], J)
 
     def calls(self, n: int, periodic: bool = False) -> int:
         return 1 + n
@@ -103,70 +141,49 @@ class SigmaPoints(Rule):
         """Returns the points' weights (p,) in covariances."""
         return w
 
-    def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
-        s, w, c = _weighted(self, m.shape[-1])
-        G, x = _spread(m, P, s)
-        y = g(x)
-        if nearest is not None:
-            y = nearest(y, g(m)[:, None])
-        mean, A, W = _regressed(G, y, s, w, c)
-        return Affine(A, mean - multiply(A, m), W)
-
-    def linearise_by_root(
+    def linearised(
         self, g: Function, m: Array, F: Array, nearest: Nearest | None = None
-    ) -> Affine:
-        s, w = self.points(m.shape[-1])
-        G = triangular(F)
-        y = g(m[..., None, :] + np.matmul(s, transposed(F)))
+    ) -> Linearised:
+        s, w, c = self.weighted(m.shape[-1])
+        y = g(_spread(m, F, s))
         if nearest is not None:
             y = nearest(y, g(m)[..., None, :])
-        mean = np.sum(w[:, None] * y, axis=-2)
-        d = y - mean[..., None, :]
-        c = self.covariance_weights(w)[:, None]
-        M = np.matmul(s.T, c * d)
-        A = G.over(transposed(M))
+        # With d = y - mean: M' = A F = sum c s d'.
+        mean = np.matmul(w, y)
+        d = np.subtract(y, mean[..., None, :])
+        M = np.matmul(transposed(c[:, None] * s), d)
         # What the law leaves of the points, which is no difference of large covariances.
-        left = d - np.matmul(s, M)
-        W = np.matmul(transposed(c * left), left)
-        return Affine(A, mean - multiply(A, m), symmetric(W))
+        d -= np.matmul(s, M)
+        if (c < 0).any():
+            W = symmetric(np.matmul(transposed(c[:, None] * d), d))
+            return Linearised(mean, transposed(M), W)
+        d *= np.sqrt(c)[:, None]
+        left = transposed(d)
+        few = len(w) <= _MOST_COLUMNS
+        return Linearised(mean, transposed(M), np.matmul(left, d), left if few else None)
 
-    def mean(self, g: Function, m: Array, P: Array) -> Array:
-        s, w, _ = _weighted(self, m.shape[-1])
-        _, points = _spread(m, P, s)
-        values = g(points)
+    def mean(self, g: Function, m: Array, F: Array) -> Array:
+        s, w, _ = self.weighted(m.shape[-1])
+        values = g(_spread(m, F, s))
         return np.sum(w[:, None, None] * values, axis=-3)
 
     def calls(self, n: int, periodic: bool = False) -> int:
         return len(self.points(n)[1]) + periodic
 
+    def weighted(self, n: int) -> tuple[Array, Array, Array]:
+        """Returns points (p, n) with their weights (p,) in means and in covariances."""
+        return _weighted(self, n)
+
 
 @functools.lru_cache(maxsize=64)
 def _weighted(rule: SigmaPoints, n: int) -> tuple[Array, Array, Array]:
-    """Returns the points (p, n) of a rule with their weights (p,) in means and in covariances."""
     s, w = map(own, rule.points(n))
     return s, w, own(rule.covariance_weights(w))
 
 
-def _spread(m: Array, P: Array, s: Array) -> tuple[Half, Array]:
-    """Returns G with P = G G', and the points m + G s (trials, p, n)."""
-    x, L = spread_points(m, P, s)
-    G = half(P, L)
-    rows = G.singular
-    if rows.any():
-        x[rows] = m[rows, None] + np.matmul(s, transposed(G.G[rows]))
-    return G, x
-
-
-def _regressed(G: Half, y: Array, s: Array, w: Array, c: Array) -> tuple[Array, Array, Array]:
-    """Returns the mean, A and W of values y (trials, p, m) at such points: with d = y - mean,
-
-    M = sum c d s',   A = M G^-1,   W = sum c d d' - M M'.
-    """
-    mean, M, A, W = regress(y, G.L, s, w, c)
-    rows = G.singular
-    if rows.any():
-        A[rows] = np.matmul(M[rows], G.inverse[rows])
-    return mean, A, W
+def _spread(m: Array, F: Array, s: Array) -> Array:
+    """Returns the points m + F s (trials, p, n)."""
+    return m[..., None, :] + np.matmul(s, transposed(F))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import Normal
 from ipe_bench.states.damped import ALIKE, Descent, LevenbergMarquardtSmoother, reported
 from ipe_bench.states.linearisation import Taylor
-from ipe_bench.states.trackers import Tracks, filtered
+from ipe_bench.states.trackers import Tracks, passed
 from ipe_bench.states.whole_paths import PathDensity, Settled
 
 _NEAR = 1e-2
@@ -74,7 +74,8 @@ def _begun(density: PathDensity, x: Array) -> Descent:
     """Begins at the smoothed paths of extended filters from the starts x (trials, n)."""
     P = _NEAR**2 * density.model.prior.covariance
     start = Normal(x, np.repeat(P[None], len(x), axis=0))
-    return Descent.of(density, filtered(density.model, density.z, Taylor(), start=start))
+    tracks, _ = passed(density.model, density.z, Taylor(), start=start)
+    return Descent.of(density, tracks)
 
 
 def in_first_turn(density: PathDensity, paths: Descent) -> Descent:

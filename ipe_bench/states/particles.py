@@ -11,8 +11,8 @@ from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.options import Count
 from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import factor, root, transposed
-from ipe_bench.states.base import Normal, StateModel
-from ipe_bench.states.trackers import Read, Tracker, Tracks, Update, residuals, squares
+from ipe_bench.states.base import StateModel
+from ipe_bench.states.trackers import Tracker, Tracks, residuals, squares
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,8 @@ def weighed(
     r = residuals(model, z, x, k)
     R = model.R_at(x, k)
     square, size = squares(r, z, R)
-    out.note_innovation(k, _innovation(model, z, r, R, before))
+    y, L = _innovation(model, z, r, R, before)
+    out.note_innovation(k, y, L, z)
     # A likelihood of exp(-800) is 0 in floating point: all are divided by the largest.
     least = square.min(axis=1, keepdims=True)
     w = before * np.exp(-0.5 * (square - least))
@@ -98,9 +99,11 @@ def weighed(
     return w / total
 
 
-def _innovation(model: StateModel, z: Array, r: Array, R: Array, before: Array | float) -> Update:
-    """Computes the innovation y = mean of r and S = covariance of r + R, by the weights before the
-    readings z (trials, m), for residuals r (trials, N, m)."""
+def _innovation(
+    model: StateModel, z: Array, r: Array, R: Array, before: Array | float
+) -> tuple[Array, Array]:
+    """Computes the innovation y = mean of r and a root of S = covariance of r + R, by the weights
+    before the readings z (trials, m), for residuals r (trials, N, m)."""
     seen = np.isfinite(z)
     both = seen[:, :, None] & seen[:, None, :]
     p = np.broadcast_to(before, r.shape[:2])
@@ -111,10 +114,7 @@ def _innovation(model: StateModel, z: Array, r: Array, R: Array, before: Array |
     d = r - y[:, None]
     # A missing reading has unit variance.
     S = np.matmul(transposed(d * p), d) + np.where(both, R, np.eye(R.shape[-1]))
-    L = factor(S)
-    # Particles have no slope; that of 0 keeps the place of the innovation's L.
-    no_slope = np.zeros((*y.shape, model.n))
-    return Update.of(Normal(y, S), y, L, seen, Read(no_slope, L, S))
+    return y, factor(S)
 
 
 def _resampled(x: Array, w: Array, offset: Array) -> Array:

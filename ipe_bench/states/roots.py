@@ -1,119 +1,19 @@
-"""Covariances that are kept as F F' with a triangular F, where readings are so precise beside what
-was known before that the covariance itself would lose the digits that they leave."""
+"""What readings that are precise beside what was known before leave of the digits of floats, and
+the steps of whole paths that hold beside such readings."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, Mask, multiply
-from ipe_bench.engine.chains import from_before, lower, smoothed_chains
-from ipe_bench.states.algebra import half, lower_solve, transposed, upper_solve
-from ipe_bench.states.base import Normal
-from ipe_bench.states.linearisation import Affine
+from ipe_bench.engine.chains import from_before, lower
+from ipe_bench.states.algebra import upper_solve
 
 _PRECISE = 1e8
 """Variance of what is read, in parts of that of its reading, above which a covariance loses half of
 its digits."""
-_BEYOND = 1e25
+BEYOND = 1e25
 """The same, above which round-off counts beside what readings leave, however it is kept."""
-
-
-class Rooted(NamedTuple):
-    """Holds normal distributions, one per trial, by roots of their covariances."""
-
-    mean: Array
-    """(trials, n)"""
-    covariance: Array
-    """F F' (trials, n, n)."""
-    root: Array
-    """F (trials, n, n), lower triangular."""
-
-    @classmethod
-    def of(cls, mean: Array, root: Array) -> Rooted:
-        return cls(mean, np.matmul(root, transposed(root)), root)
-
-    @classmethod
-    def of_normal(cls, x: Normal) -> Rooted:
-        return cls.of(x.mean, lower(half(x.covariance).G))
-
-    def moved(self, move: Affine, G: Array) -> Rooted:
-        """Returns the states A x + b + G w with w ~ N(0, I) by orthogonal rows of (A F, G) (Morf
-        and Kailath, IEEE Trans. Autom. Control 20, 1975)."""
-        m = multiply(move.A, self.mean) + move.b
-        moved = np.matmul(move.A, self.root)
-        return Rooted.of(m, lower(np.concatenate([moved, G], axis=2)))
-
-    def told(self, H: Array, y: Array, N: Array) -> tuple[Rooted, Array]:
-        """Returns the states after innovations y of readings H x + N v with v ~ N(0, I), and a root
-        L of S = H P H' + N N', by orthogonal rows of
-
-            N  H F         L        0
-            0    F    ->   P H' L^-T  F+.
-        """
-        trials, m, n = H.shape
-        before = np.zeros((trials, m + n, N.shape[2] + n))
-        before[:, :m, :-n] = N
-        before[:, :m, -n:] = np.matmul(H, self.root)
-        before[:, m:, -n:] = self.root
-        after = lower(before)
-        L = after[:, :m, :m]
-        e = lower_solve(L, y[..., None])[..., 0]
-        mean = self.mean + multiply(after[:, m:, :m], e)
-        return Rooted.of(mean, after[:, m:, m:]), L
-
-
-class Step(NamedTuple):
-    """Holds an epoch of an affine model, x = A x[k-1] + a + G w and v = B x + e with w, e ~
-    N(0, I)."""
-
-    A: Array
-    """(trials, n, n)"""
-    a: Array
-    """(trials, n)"""
-    G: Array
-    """(trials, n, q)"""
-    B: Array
-    """(trials, m, n)"""
-    v: Array
-    """(trials, m)"""
-
-
-@dataclass(frozen=True)
-class Chain:
-    """Holds the affine models of those trials whose covariances are kept by roots."""
-
-    start: Rooted
-    steps: Sequence[Step]
-
-    def smoothed(self) -> Normal:
-        """Returns the states (t, 1 + K, n) given all readings."""
-        t, n = self.start.mean.shape
-        most = max(n, *(step.G.shape[2] for step in self.steps))
-        G = np.zeros((1 + len(self.steps), t, n, most))
-        G[0, :, :, :n] = self.start.root
-        for k, step in enumerate(self.steps):
-            G[1 + k, :, :, : step.G.shape[2]] = step.G
-        A = np.stack([step.A for step in self.steps], axis=1)
-        B = np.stack([step.B for step in self.steps], axis=1)
-        a = np.stack([self.start.mean, *(step.a for step in self.steps)], axis=1)
-        v = np.stack([step.v for step in self.steps], axis=1)
-        x = solved_by_roots(A, B, np.zeros_like(a), G, a, v)
-        each = [smoothed_chains(A[[i]], B[[i]], G[:, i])[0] for i in range(t)]
-        return Normal(x, np.concatenate(each))
-
-
-class Smooth(NamedTuple):
-    """Holds what smoothing by roots found."""
-
-    rows: NDArray[np.intp]
-    """Its trials (t,)."""
-    states: Normal
-    """From before the first transition (t, 1 + K, n), given all readings."""
 
 
 def precise(H: Array, P: Array, R: Array, most: float = _PRECISE) -> Mask:
@@ -131,7 +31,7 @@ def beyond_digits(H: Array, x: Array, P: Array, R: Array) -> Mask:
     of slopes H and variances R, are so large beside R that no digits are left of what is read."""
     # Of a state itself half a unit in the last place is lost, of a covariance one in each step.
     size = np.fmax(P, (x / 10) ** 2)
-    return precise(H, size, R, _BEYOND)
+    return precise(H, size, R, BEYOND)
 
 
 def solved_by_roots(A: Array, B: Array, D: Array, G: Array, a: Array, v: Array) -> Array:

@@ -10,12 +10,11 @@ from typing import ClassVar
 import numpy as np
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import Array, Mask, finite, multiply
+from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, NonNegative
-from ipe_bench.states.algebra import half, lower_solve, symmetric, transposed
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Rule, Taylor
-from ipe_bench.states.trackers import Filter, Tracker, Tracks, filtered
+from ipe_bench.states.trackers import Filter, Tracker, Tracks, smoothed
 from ipe_bench.states.whole_paths import PathDensity, Settled
 
 _HALVINGS = 11
@@ -46,8 +45,7 @@ class Smoother(Tracker):
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         behind = self.filter
-        tracks = filtered(model, z, behind.rule, behind.iterations, smooths=True)
-        out = smoothed(model, tracks)
+        out, tracks = smoothed(model, z, behind.rule, behind.iterations)
         out.cost = tracks.nis.sum(axis=1)  # that of its path is chi-square at the minimum alone
         return out
 
@@ -141,15 +139,10 @@ class IteratedSmoother(Tracker):
 
     def _by_points(self, model: StateModel, z: Array, path: Tracks) -> Tracks:
         calls = path.calls
-        precise = path.precise
         going = np.ones(len(z), dtype=bool)
         for _ in range(self.iterations):
             # Posterior linearisation: points about the last smoothed path, then its smoother.
-            tracks = filtered(model, z, self.rule, path=path, smooths=True)
-            new = smoothed(model, tracks)
-            if precise is not None:
-                kept = [] if tracks.smooth is None else tracks.smooth.rows
-                new.lose(precise & ~np.isin(np.arange(len(z)), kept))
+            new, _ = smoothed(model, z, self.rule, path=path)
             calls = calls + np.where(going, new.calls, 0.0)
             if self.damped:
                 density = PathDensity.of(model, z)
@@ -181,98 +174,8 @@ def _arrays(tracks: Tracks) -> Iterator[Array]:
     yield tracks.mean
     yield tracks.covariance
     yield from tracks.start
-
-
-def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
-    """Passes back through a filter's tracks to before the first transition (Rauch, Tung, Striebel,
-    AIAA J. 3, 1965):
-
-        G = P[k] A' (A P[k] A' + W + Q)^-1
-        m[k] <- m[k] + G (m[k+1] - m-[k+1])
-        P[k] <- P[k] + G (P[k+1] - P-[k+1]) G'
-
-    with m-[k+1] and P-[k+1] predicted from epoch k by the affine law A of its transition.
-    """
-    trials = len(tracks.mean)
-    out = Tracks.empty(model, trials)
-    singular = np.zeros(trials, dtype=bool)
-    # At the last epoch the filter has all readings.
-    x = tracks.at(model.epochs - 1)
-    out.mean[:, -1] = x.mean
-    out.covariance[:, -1] = x.covariance
-    first = 0 if model.moved_first else 1
-    for k in range(model.epochs - 1, first - 1, -1):
-        before = tracks.at(k - 1)
-        move = tracks.moves[k - first]
-        predicted = tracks.predicted[k - first]
-        # G = (P A') (C C')^-1 with P-[k+1] = C C', which may be singular.
-        C = half(predicted.covariance)
-        singular |= C.singular
-        PA = np.matmul(before.covariance, transposed(move.A))
-        G = C.over(C.whitened(PA))
-        m = before.mean + multiply(G, x.mean - predicted.mean)
-        P = np.matmul(np.matmul(G, x.covariance - predicted.covariance), transposed(G))
-        x = Normal(m, symmetric(before.covariance + P))
-        if k:
-            out.mean[:, k - 1] = x.mean
-            out.covariance[:, k - 1] = x.covariance
-    out.start = x
-    out.moves = tracks.moves
-    out.predicted = tracks.predicted
-    out.calls = tracks.calls
-    if singular.any() and len(tracks.reads) == model.epochs:
-        _smooth_by_scores(model, tracks, out, singular)
-    if tracks.smooth is not None:
-        # A difference of covariances has no digits there.
-        rows, found = tracks.smooth
-        out.start.mean[rows] = found.mean[:, 0]
-        out.start.covariance[rows] = found.covariance[:, 0]
-        out.mean[rows] = found.mean[:, 1:]
-        out.covariance[rows] = found.covariance[:, 1:]
-    return out
-
-
-def _smooth_by_scores(model: StateModel, tracks: Tracks, out: Tracks, rows: Mask) -> None:
-    """Smooths the trials `rows` (trials,) without the inverse of a covariance of states, which then
-    may be singular (Bierman, Automatica 9, 1973): with the score r and the information N that later
-    readings hold of x[k],
-
-        m[k] <- m[k] + P[k] r,   P[k] <- P[k] - P[k] N P[k]
-
-    and, on the way from after the reading of an epoch to after that of the epoch before,
-
-        C = I - P- H' S^-1 H,   r <- A' (H' S^-1 y + C' r),   N <- A' (H' S^-1 H + C' N C) A.
-    """
-    n = model.n
-    first = 0 if model.moved_first else 1
-    # No readings are later than those of the last epoch.
-    r = np.zeros((rows.sum(), n))
-    N = np.zeros((rows.sum(), n, n))
-    for k in range(model.epochs - 1, first - 1, -1):
-        # H' S^-1 H = B' B and H' S^-1 y = B' e, with B = L^-1 H and e = L^-1 y.
-        H, L, _ = tracks.reads[k]
-        B = lower_solve(L[rows], H[rows])
-        e = np.nan_to_num(tracks.innovations[rows, k])
-        BB = np.matmul(transposed(B), B)
-        C = np.eye(n) - np.matmul(tracks.predicted[k - first].covariance[rows], BB)
-        A = tracks.moves[k - first].A[rows]
-        score = multiply(transposed(B), e) + multiply(transposed(C), r)
-        r = multiply(transposed(A), score)
-        information = BB + np.matmul(np.matmul(transposed(C), N), C)
-        N = symmetric(np.matmul(np.matmul(transposed(A), information), A))
-        before = tracks.at(k - 1)
-        P = before.covariance[rows]
-        # P - P N P, but definite where later readings leave hardly anything of a wide P.
-        G = half(P).G
-        left = np.eye(n) - np.matmul(np.matmul(transposed(G), N), G)
-        usable = finite(left)
-        values, axes = np.linalg.eigh(np.where(usable[:, None, None], symmetric(left), 0.0))
-        values[~usable] = np.nan
-        deviations = np.matmul(G, axes * np.sqrt(np.maximum(values, 0.0))[:, None])
-        smooth = np.matmul(deviations, transposed(deviations))
-        at = out.at(k - 1)
-        at.mean[rows] = before.mean[rows] + multiply(P, r)
-        at.covariance[rows] = smooth
+    if tracks.root is not None:
+        yield tracks.root
 
 
 def whole(tracks: Tracks) -> Normal:

@@ -9,55 +9,21 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import join
-from ipe_bench.basics.linalg import Array, Mask, finite, multiply
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.options import Component, Count
-from ipe_bench.states.algebra import (
-    factor,
-    half,
-    lower_solve,
-    symmetric,
-    transposed,
-    upper_solve,
-)
+from ipe_bench.states.algebra import factor, lower_solve, transposed
 from ipe_bench.states.base import Normal, StateModel
-from ipe_bench.states.linearisation import (
-    Affine,
-    Cubature,
-    Function,
-    Nearest,
-    Rule,
-    Taylor,
-    Unscented,
-)
+from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
+from ipe_bench.states.passes import Kind, Passed, Passes, Route, passes
 from ipe_bench.states.redone import believed
-from ipe_bench.states.roots import Chain, Rooted, Smooth, Step, beyond_digits, precise
-
-_STEEPEST = 1e6
-"""Largest slope about a path that is taken for one, and not for round-off."""
-_PRECISE_BY_SCORES = 1e4
-"""Variance of what is read, in parts of that of its reading, above which smoothing by scores loses
-half of its digits."""
-_LOST = 1e11
-"""The same, above which a covariance that is not kept by a root has lost its digits."""
-
-
-class Read(NamedTuple):
-    """Holds the readings of an epoch as they were linearised."""
-
-    H: Array
-    """(trials, m, n); 0 of missing readings and of particles."""
-    L: Array
-    """(trials, m, m) with L L' = S of their innovations."""
-    noise: Array
-    """Their covariance (trials, m, m) for given states; 1 of missing ones."""
+from ipe_bench.states.roots import BEYOND
 
 
 @dataclass
@@ -82,20 +48,15 @@ class Tracks:
     """Evaluations of f and of h (trials,): as many as if the trial were alone."""
     start: Normal
     """The states before the first transition."""
-    moves: list[Affine] = field(default_factory=list)
-    """The transitions as they were linearised."""
-    predicted: list[Normal] = field(default_factory=list)
-    """The states after each transition, before the reading."""
+    predicted: Array | None = None
+    """What a filter predicted of the readings (trials, K, m)."""
+    predicted_deviation: Array | None = None
+    """The standard deviations (trials, K, m) of readings about it."""
+    root: Array | None = None
+    """Triangular roots (trials, 1 + K, n (n + 1) / 2) of the covariances, from before the first
+    transition."""
     effective: Array | None = None
     """Effective sample sizes 1 / sum w^2 (trials, K) of weighted samples."""
-    reads: list[Read] = field(default_factory=list)
-    """The readings of each epoch as they were linearised."""
-    chain: Chain | None = None
-    """The affine models of the trials, if their covariances were kept by roots."""
-    smooth: Smooth | None = None
-    """What a smoother finds of those trials whose covariances had to be kept by roots."""
-    precise: Mask | None = None
-    """The trials (trials,) in which a covariance that no root keeps has lost its digits."""
     cost: Array | None = None
     """-2 log p(path | readings) (trials,) of an iterated smoother up to a constant, or the NIS of
     the filter behind a smoother: chi-square with a degree per reading; see `path_p`."""
@@ -130,68 +91,36 @@ class Tracks:
             start=spread_prior(model, trials),
         )
 
-    def at(self, k: int) -> Normal:
-        """Returns the states at epoch k; before the first transition if that is -1."""
-        return self.start if k < 0 else Normal(self.mean[:, k], self.covariance[:, k])
-
-    def note(self, k: int, found: Update) -> Normal | Rooted:
-        """Returns the states after the readings of epoch k, which the tracks keep with what the
-        innovation says."""
-        self.mean[:, k] = found.x.mean
-        self.covariance[:, k] = found.x.covariance
-        self.log_likelihood += found.log_likelihood
-        self.note_innovation(k, found)
-        return found.x
-
-    def note_innovation(self, k: int, found: Update) -> None:
-        """Keeps what the innovation of epoch k says of the filter."""
-        self.nis[:, k] = found.nis
-        self.innovations[:, k] = found.innovation
-        self.degrees[:, k] = found.degrees
-        if found.read is not None:
-            self.reads.append(found.read)
+    def note_innovation(self, k: int, y: Array, L: Array, z: Array) -> None:
+        """Keeps what an innovation y (trials, m) of covariance L L' says of the filter, by those
+        readings z (trials, m) of epoch k that are there."""
+        if self.predicted is None or self.predicted_deviation is None:
+            self.predicted = np.full(self.innovations.shape, np.nan)
+            self.predicted_deviation = self.predicted.copy()
+        seen = np.isfinite(z)
+        e = lower_solve(L, y[..., None])[..., 0]
+        self.nis[:, k] = np.sum(e**2, axis=-1)
+        self.innovations[:, k] = np.where(seen, e, np.nan)
+        self.degrees[:, k] = seen.sum(axis=-1)
+        self.predicted[:, k] = z - y
+        self.predicted_deviation[:, k] = np.linalg.norm(L, axis=-1)
 
     def predicted_readings(self, z: Array) -> tuple[Array, Array]:
         """Returns the readings (trials, K, m) that a filter predicted of those of z (trials, K, m)
         that were there, and their standard deviations; NaN in trackers that have no innovations."""
-        mean = np.full(z.shape, np.nan)
-        deviation = np.full(z.shape, np.nan)
-        for k, (_, L, _) in enumerate(self.reads):
-            # z - h = L e for normalised innovations e, and diag(S) = diag(L L').
-            y = multiply(L, np.nan_to_num(self.innovations[:, k]))
-            mean[:, k] = z[:, k] - y
-            deviation[:, k] = np.linalg.norm(L, axis=-1)
+        nothing = np.full(z.shape, np.nan)
+        if self.predicted is None or self.predicted_deviation is None:
+            return nothing, nothing
         there = np.isfinite(self.innovations)
-        return np.where(there, mean, np.nan), np.where(there, deviation, np.nan)
-
-    def about(self, rows: NDArray[np.intp]) -> Tracks:
-        """Returns the states of the trials `rows` alone."""
-        start = Normal(*(part[rows] for part in self.start))
-        part = replace(self, mean=self.mean[rows], covariance=self.covariance[rows])
-        part.start = start
-        return part
-
-    def keep(self, rows: NDArray[np.intp], other: Tracks, found: Mask) -> None:
-        """Takes what another filter of the trials `rows` found, where it did."""
-        kept = rows[found]
-        if not kept.size:
-            return
-        names = ("mean", "covariance", "nis", "innovations", "degrees", "log_likelihood")
-        for name in names:
-            getattr(self, name)[kept] = getattr(other, name)[found]
-        for name in ("moves", "predicted", "reads"):
-            for mine, its in zip(getattr(self, name), getattr(other, name), strict=True):
-                for part, new in zip(mine, its, strict=True):
-                    part[kept] = new[found]
+        return (
+            np.where(there, self.predicted, np.nan),
+            np.where(there, self.predicted_deviation, np.nan),
+        )
 
     def lose(self, lost: Mask) -> None:
         """Makes NaN what is said of the states of those trials (trials,) that have no digits."""
         for said in (self.mean, self.covariance, self.nis, self.log_likelihood):
             said[lost] = np.nan
-        if self.smooth is not None:
-            rows, states = self.smooth
-            for said in states:
-                said[lost[rows]] = np.nan
 
     @classmethod
     def lost(cls, model: StateModel, trials: int) -> Tracks:
@@ -203,13 +132,9 @@ class Tracks:
 
     @classmethod
     def join(cls, parts: Sequence[Tracks]) -> Tracks:
-        """Joins the trials of several batches one after another, without what smoothers need; what
-        trials lack that others have is NaN, or the status and the iterations of none."""
-        alone = [
-            replace(part, moves=[], predicted=[], reads=[], chain=None, smooth=None, precise=None)
-            for part in parts
-        ]
-        joined = join(alone)
+        """Joins the trials of several batches one after another; what trials lack that others have
+        is NaN, or the status and the iterations of none."""
+        joined = join(parts)
         if joined.status is not None:
             joined.status = np.nan_to_num(joined.status).astype(np.int8)
         if joined.iterations is not None:
@@ -273,110 +198,6 @@ def spread_prior(model: StateModel, trials: int) -> Normal:
     return Normal(np.repeat(m[None], trials, axis=0), np.repeat(P[None], trials, axis=0))
 
 
-def predict(x: Normal, move: Affine, Q: Array) -> Normal:
-    """Moves the states by A x + b + e + w, with e ~ N(0, W) of the rule and process noise w ~ N(0,
-    Q (n, n)):
-
-    m <- A m + b
-    P <- A P A' + W + Q
-    """
-    m = multiply(move.A, x.mean) + move.b
-    APA = np.matmul(np.matmul(move.A, x.covariance), transposed(move.A))
-    return Normal(m, symmetric(APA + move.W + Q))
-
-
-def _linearised(rule: Rule, g: Function, x: Normal | Rooted, nearest: Nearest | None) -> Affine:
-    if isinstance(x, Rooted):
-        return rule.linearise_by_root(g, x.mean, x.root, nearest)
-    return rule.linearise(g, *x, nearest)
-
-
-def linearised_move(
-    model: StateModel, rule: Rule, k: int, x: Normal | Rooted, to: Array | None = None
-) -> Affine:
-    """Linearises f about the states x; periodic states next to those of `to` (trials, n), if these
-    are given."""
-    periodic = bool(model.state_periods)
-    nearest = model.nearest_state if periodic else None
-    move = _linearised(rule, model.transition_into(k), x, nearest)
-    if to is None or not periodic:
-        return move
-    # b takes the whole periods between f(x) and the path.
-    value = multiply(move.A, x.mean) + move.b
-    return move._replace(b=move.b + model.nearest_state(value, to) - value)
-
-
-def linearised_reading(
-    model: StateModel, rule: Rule, k: int, z: Array, x: Normal | Rooted
-) -> Affine:
-    """Linearises h about the states x, periodic readings next to the readings z (trials, m)."""
-    nearest = model.nearest if model.periods else None
-    read = _linearised(rule, model.observation_at(k), x, nearest)
-    # b takes the whole periods between h(x) and the readings that are there.
-    value = multiply(read.A, x.mean) + read.b
-    to = np.where(np.isfinite(z), z, value)
-    return read._replace(b=read.b + model.nearest(value, to) - value)
-
-
-class Update(NamedTuple):
-    """Holds the states after a reading, and what the innovation says of the filter."""
-
-    x: Normal | Rooted
-    innovation: Array
-    nis: Array
-    degrees: Array
-    log_likelihood: Array
-    read: Read | None = None
-
-    @classmethod
-    def of(
-        cls, x: Normal | Rooted, y: Array, L: Array, seen: Mask, read: Read | None = None
-    ) -> Update:
-        """Holds the states x after an innovation y (trials, m) of covariance L L', by a reading as
-        it was linearised; only readings that are `seen` count."""
-        # The normalised innovation e = L^-1 y has the NIS y' S^-1 y = e' e.
-        e = lower_solve(L, y[..., None])[..., 0]
-        nis = np.sum(e**2, axis=-1)
-        degrees = seen.sum(axis=-1)
-        # log N(y; 0, S), S = L L', of which a missing reading has no part.
-        log_determinant = 2 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1)
-        log_likelihood = -0.5 * (nis + log_determinant + degrees * np.log(2 * np.pi))
-        return cls(x, np.where(seen, e, np.nan), nis, degrees, log_likelihood, read)
-
-
-def update(x: Normal | Rooted, read: Affine, R: Array, z: Array) -> Update:
-    """Takes in the readings z = H x + b + e + v (trials, m), e ~ N(0, W) of the rule and v ~ N(0, R
-    (m, m)):
-
-        y = z - H m - b,   S = H P H' + W + R,   K = P H' S^-1
-        m <- m + K y
-        P <- (I - K H) P (I - K H)' + K (W + R) K'
-
-    This form of P, Joseph's, stays positive definite; where the prior is so much wider than R that
-    it loses digits, x is given by a root of P. A missing reading has no slope and unit variance.
-    """
-    m = x.mean
-    P = x.covariance
-    seen = np.isfinite(z)
-    both = seen[..., :, None] & seen[..., None, :]
-    H = np.where(seen[..., None], read.A, 0.0)
-    y = np.where(seen, z - multiply(read.A, m) - read.b, 0.0)
-    noise = np.where(both, read.W + R, np.eye(R.shape[-1]))
-    if isinstance(x, Rooted):
-        after, L = x.told(H, y, half(noise).G)
-        return Update.of(after, y, L, seen, Read(H, L, noise))
-    # S = L L'
-    PH = np.matmul(P, transposed(H))
-    L = factor(np.matmul(H, PH) + noise)
-    # K' = S^-1 H P = L^-T L^-1 (P H')'
-    K = transposed(upper_solve(L, lower_solve(L, transposed(PH))))
-    rest = np.eye(m.shape[-1]) - np.matmul(K, H)
-    unread = np.matmul(np.matmul(rest, P), transposed(rest))
-    added = np.matmul(np.matmul(K, noise), transposed(K))
-    after = Normal(m + multiply(K, y), symmetric(unread + added))
-    return Update.of(after, y, L, seen, Read(H, L, noise))
-
-
 @dataclass(frozen=True)
 class Filter(Tracker):
     """A Gaussian filter: predict by the linearised transition, update by the linearised reading.
@@ -430,169 +251,117 @@ def filtered(
     iterations: int = 1,
     path: Tracks | None = None,
     start: Normal | None = None,
-    smooths: bool = False,
 ) -> Tracks:
     """Runs the filter of the model that a rule linearises about the filter's own states, or about
-    those of a path; `start` replaces the prior, and `smooths` tells whether a smoother follows."""
-    start = start or spread_prior(model, len(z))
-    tracks = _filtered(model, z, rule, iterations, path, start)
-    before = _Before.of(tracks)
-    losing = before.loses_digits(smooths)
-    lost = precise(before.H, before.variances, before.R, _LOST)
-    tracks.precise = lost.copy()
-    if iterations > 1 or path is not None:
-        # About states whose covariance has lost its digits nothing is found at all.
-        losing |= ~finite(tracks.mean)
-    rows = np.flatnonzero(losing)
-    if rows.size:
-        about = None if path is None else path.about(rows)
-        begun = Rooted.of_normal(Normal(start.mean[rows], start.covariance[rows]))
-        other = _filtered(model, z[rows], rule, iterations, about, begun, smooths)
-        tracks.calls[rows] += other.calls
-        found = finite(other.mean) & finite(other.covariance)
-        smooth = other.chain.smoothed() if smooths and other.chain else None
-        if smooth is not None:
-            found &= finite(smooth.mean) & finite(smooth.covariance)
-        if path is not None:
-            # About a path that is nearly known, slopes by points may be round-off.
-            for move in other.moves:
-                found &= (np.abs(move.A) < _STEEPEST).all(axis=(1, 2))
-        tracks.keep(rows, other, found)
-        lost[rows[found]] = False
-        if smooth is not None:
-            states = Normal(smooth.mean[found], smooth.covariance[found])
-            tracks.smooth = Smooth(rows[found], states)
-        before = _Before.of(tracks)
-    # Slopes by points about a path that is nearly known may be round-off themselves, and tell
-    # nothing of digits; the filter whose path it is has told.
-    if path is None or isinstance(rule, Taylor):
-        tracks.lose(lost | beyond_digits(before.H, before.mean, before.variances, before.R))
-    return tracks
+    those of a path; `start` replaces the prior."""
+    return _passed(model, z, Kind(rule, iterations, about=path is not None), path, start)[0]
 
 
-class _Before(NamedTuple):
-    """Holds what a filter knew before the readings of each epoch."""
-
-    mean: Array
-    """(trials, K, n)"""
-    covariance: Array
-    """(trials, K, n, n)"""
-    H: Array
-    """Slopes (trials, K, m, n) of the readings."""
-    R: Array
-    """Their variances (trials, K, m)."""
-
-    @classmethod
-    def of(cls, tracks: Tracks) -> _Before:
-        each = list(tracks.predicted)
-        if len(each) < len(tracks.reads):
-            each.insert(0, tracks.start)
-        mean = np.stack([x.mean for x in each], axis=1)
-        covariance = np.stack([x.covariance for x in each], axis=1)
-        H = np.stack([read.H for read in tracks.reads], axis=1)
-        R = np.stack([_variances(read.noise) for read in tracks.reads], axis=1)
-        return cls(mean, covariance, H, R)
-
-    @property
-    def variances(self) -> Array:
-        """(trials, K, n)"""
-        return _variances(self.covariance)
-
-    def loses_digits(self, smooths: bool) -> Mask:
-        """Tells in which trials readings leave less of a covariance than its digits (trials,)."""
-        P = self.variances
-        losing = precise(self.H, P, self.R)
-        if not smooths:
-            return losing
-        # Smoothers of singular covariances go by scores, which lose digits twice as fast.
-        rows = np.flatnonzero(precise(self.H, P, self.R, _PRECISE_BY_SCORES) & ~losing)
-        if rows.size:
-            losing[rows] = half(self.covariance[rows]).singular.any(axis=1)
-        return losing
-
-
-def _variances(P: Array) -> Array:
-    return np.diagonal(P, axis1=-2, axis2=-1)
-
-
-def _alike(at: Normal, x: Normal | Rooted) -> Normal | Rooted:
-    """Returns the states `at` in the form of the states x."""
-    return Rooted.of_normal(at) if isinstance(x, Rooted) else at
-
-
-def _noise_root(G: Array, move: Affine) -> Array:
-    """Returns a root (trials, n, q) of the covariance of a transition's noise."""
-    each = np.broadcast_to(G, (len(move.W), *G.shape[-2:]))
-    own = half(move.W).G if move.W.any() else np.zeros(move.W.shape)
-    return np.concatenate([each, own], axis=2)
-
-
-def _step(x: Rooted, move: Affine | None, G: Array | None, found: Update) -> Step:
-    """Returns the affine model of an epoch, of states x after the transition."""
-    read = found.read
-    assert read is not None
-    y = multiply(read.L, np.nan_to_num(found.innovation))
-    N = half(read.noise)
-    B = transposed(N.whitened(transposed(read.H)))
-    v = N.whitened((y + multiply(read.H, x.mean))[:, None])[:, 0]
-    if move is None or G is None:
-        still = np.broadcast_to(np.eye(x.mean.shape[1]), x.root.shape)
-        return Step(still, np.zeros_like(x.mean), still[:, :, :0], B, v)
-    return Step(move.A, move.b, G, B, v)
-
-
-def _filtered(
+def smoothed(
     model: StateModel,
     z: Array,
     rule: Rule,
-    iterations: int,
-    path: Tracks | None,
-    start: Normal | Rooted,
-    smooths: bool = False,
-) -> Tracks:
-    out = Tracks.empty(model, len(z))
-    out.start = Normal(start.mean, start.covariance)
-    x = start
-    steps: list[Step] = []
-    for k in range(model.epochs):
-        move = G = None
-        if model.moves(k):
-            # f is linearised about the filter's states, or about those of the path.
-            at = x if path is None else _alike(path.at(k - 1), x)
-            to = None if path is None else path.mean[:, k]
-            move = linearised_move(model, rule, k, at, to)
-            Q = None
-            if model.gain_by_state:
-                Q = rule.mean(partial(model.Q_at, k=k), at.mean, at.covariance)
-            if isinstance(x, Rooted):
-                G = _noise_root(model.gain(k) if Q is None else half(Q).G, move)
-                x = x.moved(move, G)
-            else:
-                x = predict(x, move, model.Q(k) if Q is None else Q)
-            out.moves.append(move)
-            out.predicted.append(Normal(x.mean, x.covariance))
-        at = x if path is None else _alike(path.at(k), x)
-        found = None
-        for _ in range(iterations):
-            # Each iteration takes the readings into the prediction x, h linearised about the
-            # states that the last one found.
-            if model.R_by_state:
-                R = rule.mean(partial(model.R_at, k=k), at.mean, at.covariance)
-            else:
-                R = model.R(k)
-            read = linearised_reading(model, rule, k, z[:, k], at)
-            found = update(x, read, R, z[:, k])
-            at = found.x
-        assert found is not None
-        if isinstance(x, Rooted) and smooths:
-            steps.append(_step(x, move, G, found))
-        x = out.note(k, found)
-    if isinstance(start, Rooted) and smooths:
-        out.chain = Chain(start, steps)
-    calls_of_f = rule.calls(model.n, bool(model.state_periods))
-    calls_of_h = rule.calls(model.n, bool(model.periods))
-    out.calls += calls_of_f * len(out.moves) + calls_of_h * iterations * model.epochs
-    return out
+    iterations: int = 1,
+    path: Tracks | None = None,
+    start: Normal | None = None,
+) -> tuple[Tracks, Tracks]:
+    """Runs the same filter and its smoother (Rauch, Tung and Striebel, AIAA J. 3, 1965), and
+    returns what each of them finds, that of the smoother in front."""
+    smooth, tracks = passed(model, z, rule, iterations, path, start)
+    lost = np.isnan(tracks.log_likelihood)
+    smooth.lose(lost)
+    for said in smooth.start:
+        said[lost] = np.nan
+    return smooth, tracks
+
+
+def passed(
+    model: StateModel,
+    z: Array,
+    rule: Rule,
+    iterations: int = 1,
+    path: Tracks | None = None,
+    start: Normal | None = None,
+) -> tuple[Tracks, Tracks]:
+    """Does the same, for paths that are a beginning: those that have no digits are there, too."""
+    kind = Kind(rule, iterations, smooths=True, about=path is not None)
+    tracks, smooth = _passed(model, z, kind, path, start)
+    return smooth, tracks
+
+
+def _passed(
+    model: StateModel, z: Array, kind: Kind, path: Tracks | None, start: Normal | None
+) -> tuple[Tracks, Tracks]:
+    """Runs passes of as many trials at once as memory allows."""
+    there = passes(model, kind)
+    start = start or spread_prior(model, len(z))
+    route = None if path is None else _route(path, there)
+    at_once = there.at_once
+    parts = []
+    for i in range(0, max(len(z), 1), at_once):
+        rows = slice(i, i + at_once)
+        about = None if route is None else Route(route.mean[rows], route.root[rows])
+        first = Normal(start.mean[rows], start.covariance[rows])
+        found = there.run(z[rows], about, first)
+        parts.append(_found(there, found, z[rows], first))
+    tracks, smooth = parts[0] if len(parts) == 1 else map(Tracks.join, zip(*parts, strict=True))
+    calls = _calls(model, kind)
+    tracks.calls = np.full(len(z), calls)
+    smooth.calls = np.full(len(z), calls)
+    return tracks, smooth
+
+
+def _calls(model: StateModel, kind: Kind) -> float:
+    """Counts the evaluations of f and of h of a trial that is alone."""
+    of_f = kind.rule.calls(model.n, bool(model.state_periods))
+    of_h = kind.rule.calls(model.n, bool(model.periods))
+    moves = model.evaluations - model.epochs
+    return float(of_f * moves + of_h * kind.iterations * model.epochs)
+
+
+def _route(path: Tracks, there: Passes) -> Route:
+    """Returns the states of a path."""
+    mean = np.concatenate([path.start.mean[:, None], path.mean], axis=1)
+    # Tangents take no covariance.
+    root = np.zeros((*mean.shape[:2], there.sizes.half)) if path.root is None else path.root
+    return Route(mean, root)
+
+
+def _found(there: Passes, found: Passed, z: Array, start: Normal) -> tuple[Tracks, Tracks]:
+    """Returns what passes say of some trials: a filter, and the smoother behind it. Where states or
+    their covariances are so large that floats hold no digits of the readings, a filter says
+    nothing."""
+    layout = there.sizes.shown
+    n = there.sizes.n
+    after = found.shown[:, 1:]
+    seen = np.isfinite(z)
+    log_likelihood, doubt = found.carried[:, -2:].T.copy()
+    lost = doubt > BEYOND
+    tracks = Tracks(
+        mean=layout.part(after, "x"),
+        covariance=layout.part(after, "covariance", n, n),
+        nis=layout.part(after, "nis")[..., 0],
+        innovations=np.where(seen, layout.part(after, "e"), np.nan),
+        degrees=seen.sum(axis=2).astype(float),
+        log_likelihood=log_likelihood,
+        calls=np.zeros(len(z)),
+        start=start,
+        predicted=layout.part(after, "predicted"),
+        predicted_deviation=layout.part(after, "deviation"),
+        root=layout.part(found.shown, "F"),
+    )
+    tracks.lose(lost)
+    if found.back is None:
+        return tracks, tracks
+    of_states = there.sizes.back
+    mean = of_states.part(found.back, "x")
+    covariance = of_states.part(found.back, "covariance", n, n)
+    smooth = Tracks.empty(there.model, len(z))
+    smooth.start = Normal(mean[:, 0], covariance[:, 0])
+    smooth.mean = mean[:, 1:]
+    smooth.covariance = covariance[:, 1:]
+    smooth.root = of_states.part(found.back, "F")
+    return tracks, smooth
 
 
 def misfit(model: StateModel, z: Array, x: Array, k: int) -> tuple[Array, Array]:

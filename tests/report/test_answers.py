@@ -397,7 +397,7 @@ class Overflowing(Tracker):
     def track(self, model, z):
         tracks = ekf().track(model, z)
         tracks.mean[:, 20:], tracks.covariance[:, 20:] = np.inf, np.inf
-        tracks.reads.clear()
+        tracks.predicted = tracks.predicted_deviation = None
         return tracks
 
 

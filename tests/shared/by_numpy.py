@@ -13,12 +13,11 @@ from unittest.mock import patch
 import numpy as np
 from shared import chains_by_numpy
 
-from ipe_bench.engine import chains, points
+from ipe_bench.engine import chains
 from ipe_bench.engine.integrator import Kernel
 from ipe_bench.engine.plan import Recording
 from ipe_bench.engine.rows import RowFunction
 from ipe_bench.engine.trace import Program
-from ipe_bench.states.algebra import factor, transposed, upper_solve
 
 
 @contextmanager
@@ -29,7 +28,6 @@ def by_numpy():
         patch.object(RowFunction, "__call__", row_values),
         patch.object(RowFunction, "slopes", row_slopes),
         patch.object(chains, "_run", chains_by_numpy.run),
-        patch.object(points, "_run", run_points),
     ):
         yield
 
@@ -61,22 +59,6 @@ def _recorded(self, x, c):
 def _joined(outputs, shape):
     """Joins outputs, of which some may be single numbers, along a last axis."""
     return np.stack([np.broadcast_to(one, shape) for one in outputs], axis=-1)
-
-
-def run_points(name, _size, _parts, arrays, _points):
-    """Spreads points, or regresses their values, as `engine.points` says."""
-    if name == "spreads":
-        m, P, s, L, x = arrays
-        L[:] = factor(P)
-        x[:] = m[:, None] + np.matmul(s, transposed(L))
-        return
-    L, s, w, c, y, mean, M, A, W = arrays
-    mean[:] = np.sum(w[:, None] * y, axis=1)
-    d = y - mean[:, None]
-    weighted = transposed(d * c[:, None])
-    M[:] = np.matmul(weighted, s)
-    A[:] = transposed(upper_solve(L, transposed(M)))
-    W[:] = np.matmul(weighted, d) - np.matmul(M, transposed(M))
 
 
 @functools.cache

@@ -11,7 +11,6 @@ from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, Unscen
 from ipe_bench.states import Filter, Normal, Taylor, Tracks, Unscented
 from ipe_bench.states.algebra import factor
 from ipe_bench.states.linearisation import slope
-from ipe_bench.states.trackers import Update
 
 
 @dataclass(frozen=True)
@@ -25,8 +24,8 @@ class Filterpy(Filter):
             f.x, f.P = mean, covariance
         for k in range(model.epochs):
             if model.moves(k):
-                move, Q = rule.linearise(lambda at, k=k: model.transition(at, k), *x), model.Q(k)
-                for f, F, moved in zip(filters, move.A, model.transition(x.mean, k), strict=True):
+                A, Q = rule.linearise(lambda at, k=k: model.transition(at, k), *x).A, model.Q(k)
+                for f, F, moved in zip(filters, A, model.transition(x.mean, k), strict=True):
                     f.Q, f.F = Q, F
                     if isinstance(rule, Taylor):
                         f.predict()
@@ -34,15 +33,18 @@ class Filterpy(Filter):
                     else:
                         f.predict(fx=lambda at, _, k=k: model.transition(at, k))
                 x = Normal(np.array([f.x for f in filters]), np.array([f.P for f in filters]))
-                out.moves.append(move)
-                out.predicted.append(x)
             (h, H), R = slope(lambda at, k=k: model.observe(at, k), x.mean), model.R(k)
             for f, *read in zip(filters, z[:, k], h, H, strict=True):
                 _take_in(f, model, k, R, *read)
             mean, P, y, S = (
                 np.array([getattr(f, name) for f in filters]) for name in ("x", "P", "y", "S")
             )
-            x = out.note(k, Update.of(Normal(mean, P), y, factor(S), np.isfinite(z[:, k])))
+            x = Normal(mean, P)
+            out.mean[:, k], out.covariance[:, k] = x
+            L, seen = factor(S), np.isfinite(z[:, k])
+            out.note_innovation(k, y, L, z[:, k])
+            size = np.log(2 * np.pi) + 2 * np.log(np.diagonal(L, axis1=1, axis2=2))
+            out.log_likelihood -= 0.5 * (out.nis[:, k] + np.sum(size * seen, axis=1))
         return out
 
 

@@ -28,6 +28,7 @@ from ipe_bench.states import (
     posterior_bounds,
     ukf,
 )
+from ipe_bench.states.algebra import triangular
 from ipe_bench.states.trackers import filtered
 from ipe_bench.trials.paths import PathBlock, StateScenario
 from ipe_bench.workshop.conformance import check_component
@@ -168,12 +169,17 @@ def test_a_step_has_the_mean_and_the_covariance_of_many_draws():
     moved = ROVER.transition(before, 0) + np.einsum(
         "tij,tj->ti", ROVER.gain_at(before, 0), rng.normal(size=(N, 2))
     )
-    x = filtered(replace(ROVER, count=1), blind, rule).predicted[0]
+    predicted = filtered(replace(ROVER, count=1), blind, rule)
+    x = Normal(predicted.mean[:, 0], predicted.covariance[:, 0])
     near = rng.multivariate_normal(x.mean[0], x.covariance[0], N)
     deviations = np.sqrt(np.einsum("tii->ti", ROVER.R_at(near, 0)))
     read = ROVER.observe(near, 0) + deviations * rng.normal(size=(N, 2))
     A, b, W = rule.linearise(lambda x: ROVER.observe(x, 0), *x)
-    S = A @ x.covariance @ A.swapaxes(1, 2) + W + rule.mean(lambda x: ROVER.R_at(x, 0), *x)
+    S = (
+        A @ x.covariance @ A.swapaxes(1, 2)
+        + W
+        + rule.mean(lambda x: ROVER.R_at(x, 0), x.mean, triangular(x.covariance))
+    )
     for draws, mean, covariance in ((moved, x.mean, x.covariance), (read, x.mean @ A[0].T + b, S)):
         d = draws - mean
         products = d[:, :, None] * d[:, None, :]
@@ -183,7 +189,7 @@ def test_a_step_has_the_mean_and_the_covariance_of_many_draws():
         if draws is moved:
             at_mean = (
                 covariance[0]
-                - rule.mean(lambda x: ROVER.Q_at(x, 0), m[None], P[None])[0]
+                - rule.mean(lambda x: ROVER.Q_at(x, 0), m[None], triangular(P[None]))[0]
                 + ROVER.Q_at(m, 0)
             )
             assert (np.abs(products.mean(axis=0) - at_mean) / error)[0, 1] > 10

@@ -28,7 +28,7 @@ from ipe_bench.states import (
 )
 from ipe_bench.states.damped import Descent
 from ipe_bench.states.smoothers import path_p, whole
-from ipe_bench.states.trackers import filtered, linearised_move
+from ipe_bench.states.trackers import Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity
 from ipe_bench.trials.paths import PathBlock, StateScenario
 
@@ -191,15 +191,16 @@ def test_a_state_that_comes_round_is_followed_next_to_its_path():
         def state_periods(self):
             return 2 * np.pi, 0.0
 
-    model, x = (
-        Heading(count=3),
-        Normal(np.array([[3.0, 0.5], [3.0, -9.0]]), np.array([np.eye(2)] * 2)),
-    )
+    model = Heading(count=1)
+    x = Normal(np.array([[3.0, 0.5], [3.0, -9.0]]), np.array([np.eye(2)] * 2))
     turns = np.array([[2 * np.pi, 0.0], [-6 * np.pi, 0.0]])
-    to = model.transition(x.mean, 0) + turns + [0.4, 30.0]
+    path = Tracks.empty(model, 2)
+    path.start = x
+    path.mean[:, 0] = model.transition(x.mean, 0) + turns + [0.4, 30.0]
+    path.root = np.tile([1.0, 0.0, 1.0], (2, 2, 1))
+    blind = np.full((2, 1, 1), np.nan)
     for rule in (Taylor(), Cubature()):
-        move = linearised_move(model, rule, 0, x, to)
-        moved = np.einsum("tij,tj->ti", move.A, x.mean) + move.b
+        moved = filtered(model, blind, rule, path=path, start=x).mean[:, 0]
         np.testing.assert_allclose(moved, model.transition(x.mean, 0) + turns, atol=1e-12)
 
 

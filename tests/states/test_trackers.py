@@ -373,7 +373,8 @@ def test_an_iterated_update_is_the_most_probable_state_after_a_reading():
     model = Pendulum(count=1, start=(1.2, 0.0), spread=0.5, variance=1e-3)
     z = np.array([[[0.6]], [[0.85]], [[0.99]]])
     tracks = Filter(Taylor(), 60).track(model, z)
-    (m, P), first = tracks.predicted[0], Filter(Taylor()).track(model, z)
+    predicted, first = (Filter(Taylor()).track(model, each) for each in (z * np.nan, z))
+    m, P = predicted.mean[:, 0], predicted.covariance[:, 0]
     for trial in range(3):
         root = np.linalg.inv(np.linalg.cholesky(P[trial]))
 

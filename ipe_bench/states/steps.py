@@ -1,0 +1,295 @@
+"""Steps of Gaussian filters and smoothers of one trial at one epoch, in lists of numbers: run on
+unknowns they leave a program for `engine.scan`, run on numbers they are its reference.
+
+A covariance is F F' with a triangular F, which orthogonal rows take from step to step (Bierman,
+Factorization Methods for Discrete Sequential Estimation, 1977); nothing is inverted, and nothing
+subtracted from a covariance:
+
+    predict   (A F, N)            ->  (F-, 0)            x- = A x + b,  N N' = Q + W
+    update    (M, H F; 0, F-)     ->  (L, 0; X, F+)      x+ = x- + X e,  L e = y,  M M' = R + W
+
+Rows of (I, 0) below these give the old unit noise by the new one, which is all that a smoother
+takes. Conditions are `where`: a missing reading is a row of zeros.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from operator import add, mul
+from typing import Any, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+
+from ipe_bench.engine.scan import dot, orthogonalised, product
+
+_SMALL = 1e-14
+"""Part of a row's length, or of a pivot's row, that is round-off."""
+_HIDDEN = 0.01
+"""Square of the part of a state that counts beside its deviation: half a unit in the last place of
+the state is lost, one of the covariance in each step."""
+
+Number: TypeAlias = Any
+"""A float, an array of them or an expression."""
+Vector: TypeAlias = "list[Number]"
+Rows: TypeAlias = "list[list[Number]]"
+
+
+class Function(Protocol):
+    """f or h of an epoch."""
+
+    @property
+    def periods(self) -> Sequence[float]: ...
+
+    def __call__(self, x: Vector) -> Vector: ...
+
+    def slopes(self, x: Vector) -> tuple[Vector, Rows]:
+        """Computes values (m) and slopes (m, n)."""
+        ...
+
+
+class State(NamedTuple):
+    """Holds N(x, F F')."""
+
+    x: Vector
+    F: Rows
+
+
+class Linear(NamedTuple):
+    """Holds y = A x + b + e about a state."""
+
+    y: Vector
+    """A x + b"""
+    AF: Rows
+    left: Rows
+    """What the rule leaves of each value, whose covariance is W."""
+    A: Rows
+
+
+class Law(Protocol):
+    """A rule that linearises functions, in lists."""
+
+    def __call__(self, g: Function, state: State, at: State) -> Linear:
+        """Linearises g about the states `at`, and takes it at `state`."""
+        ...
+
+    def noise(self, N: Rows, linear: Linear) -> Rows:
+        """Returns a root of N N' + W."""
+        ...
+
+
+def plus(x: Sequence[Number], A: Rows, u: Sequence[Number]) -> Vector:
+    """Computes x + A u."""
+    return [dot(row, u, start) for start, row in zip(x, A, strict=True)]
+
+
+def beside(*blocks: Rows) -> Rows:
+    return [[a for row in rows for a in row] for rows in zip(*blocks, strict=True)]
+
+
+def zeros(rows: int, columns: int) -> Rows:
+    return [[0.0] * columns for _ in range(rows)]
+
+
+def unit(n: int) -> Rows:
+    return [[float(i == j) for j in range(n)] for i in range(n)]
+
+
+def lower(W: Rows, checked: int = 0) -> Rows:
+    """Computes the triangular F with F F' = W W', by orthogonal rows (modified Gram and Schmidt);
+    of the first `checked` rows, those that the rows above give but for round-off become 0."""
+    return orthogonalised(W, checked, _SMALL)
+
+
+def over(X: Rows, F: Rows) -> Rows:
+    """Computes X F^-1 for a triangular F; pivots that are round-off count for nothing."""
+    n = len(F)
+    out = zeros(len(X), n)
+    for j in reversed(range(n)):
+        pivot = F[j][j]
+        none = np.less_equal(pivot * pivot, _SMALL**2 * dot(F[j], F[j]))
+        inverse = np.where(none, 0.0, 1.0) / np.where(none, 1.0, pivot)
+        below = [F[k][j] for k in range(j + 1, n)]
+        for x, found in zip(X, out, strict=True):
+            found[j] = (x[j] - dot(found[j + 1 :], below)) * inverse
+    return out
+
+
+def root(W: Rows, sizes: Vector) -> Rows:
+    """Computes a triangular root of a covariance W by Cholesky's way, with columns of 0 where a
+    pivot is round-off beside the variance and a size; not a number if W is indefinite."""
+    n = len(W)
+    F = zeros(n, n)
+    for j in range(n):
+        square = W[j][j] - dot(F[j][:j], F[j][:j])
+        least = _SMALL * (np.maximum(W[j][j], 0.0) + sizes[j])
+        some = np.less(least, square)
+        none = np.less_equal(-least, square)
+        length = np.sqrt(np.where(some, square, 1.0))
+        inverse = np.where(some, 1.0, 0.0) / length
+        F[j][j] = np.where(some, length, np.where(none, 0.0, np.nan))
+        for i in range(j + 1, n):
+            F[i][j] = (W[i][j] - dot(F[i][:j], F[j][:j])) * inverse
+    return F
+
+
+def near(y: Vector, to: Vector, periods: Sequence[float]) -> Vector:
+    """Shifts values by whole periods next to others."""
+    if not any(periods):
+        return y
+    shifted = []
+    for a, b, period in zip(y, to, periods, strict=True):
+        shifted.append(a - period * np.floor((a - b) / period + 0.5) if period else a)
+    return shifted
+
+
+class Tangent:
+    """Linearises by the tangent at a mean."""
+
+    def __call__(self, g: Function, state: State, at: State) -> Linear:
+        y, A = g.slopes(at.x)
+        apart = [a - b for a, b in zip(state.x, at.x, strict=True)]
+        return Linear(plus(y, A, apart), product(A, state.F), [[] for _ in y], A)
+
+    def noise(self, N: Rows, linear: Linear) -> Rows:
+        return N
+
+
+class Regression(NamedTuple):
+    """Linearises by statistical regression on points of the standard normal distribution."""
+
+    s: Rows
+    """(p, n)"""
+    w: Vector
+    """Weights (p) in means."""
+    c: Vector
+    """Weights (p) in covariances."""
+
+    def __call__(self, g: Function, state: State, at: State) -> Linear:
+        values = [g(plus(at.x, at.F, point)) for point in self.s]
+        if any(g.periods):
+            # The mean of points on both sides of a jump would lie opposite.
+            center = g(at.x)
+            values = [near(y, center, g.periods) for y in values]
+        columns = [list(column) for column in zip(*values, strict=True)]
+        mean = [dot(self.w, column) for column in columns]
+        off = [[a - middle for a in column] for column, middle in zip(columns, mean, strict=True)]
+        weighted = [[*map(mul, self.c, column)] for column in off]
+        AF = [[dot(row, along) for along in zip(*self.s, strict=True)] for row in weighted]
+        left = []
+        for column, row in zip(off, AF, strict=True):
+            left.append([a - dot(row, s) for a, s in zip(column, self.s, strict=True)])
+        A = over(AF, at.F)
+        if at is state:
+            return Linear(mean, AF, left, A)
+        apart = [a - b for a, b in zip(state.x, at.x, strict=True)]
+        return Linear(plus(mean, A, apart), product(A, state.F), left, A)
+
+    def noise(self, N: Rows, linear: Linear) -> Rows:
+        left = linear.left
+        if min(self.c) >= 0:
+            deviations = np.sqrt(self.c)
+            return beside(N, [[*map(mul, deviations, row)] for row in left])
+        # A negative weight leaves a difference, which has no root of its own.
+        weighted = [[*map(mul, self.c, row)] for row in left]
+        W = []
+        for own, row in zip(N, weighted, strict=True):
+            pairs = zip(N, left, strict=True)
+            W.append([dot(own, noise, dot(row, other)) for noise, other in pairs])
+        return root(W, [dot(row, row) for row in linear.AF])
+
+
+def predicted(linear: Linear, N: Rows, smooths: bool) -> tuple[State, Rows]:
+    """Returns the states after a transition with noise of the root N, and for a smoother rows
+    (X, Y): the old unit noise is X times the new one, and Y times another."""
+    n = len(N)
+    W = beside(linear.AF, N)
+    W += beside(unit(n), zeros(n, len(N[0]))) if smooths else []
+    both = lower(W, n)
+    return State(linear.y, [row[:n] for row in both[:n]]), both[n:]
+
+
+class Update(NamedTuple):
+    """Holds the states after readings, and what these say."""
+
+    state: State
+    e: Vector
+    """Normalised innovations (m), 0 of missing readings."""
+    L: Rows
+    """L L' is the covariance of innovations; rows of 0 of missing readings."""
+    doubt: Number
+    """The largest variance of what is read by the digits of a float, in parts of a reading's."""
+    told: Rows
+    """For a smoother rows (X, Y, Z): the old unit noise is X e, Y times the new one, and Z times
+    another."""
+
+
+def updated(
+    state: State, linear: Linear, M: Rows, z: Vector, periods: Sequence[float], smooths: bool
+) -> Update:
+    """Takes in readings z, NaN where missing, with noise of the root M."""
+    m = len(z)
+    n = len(state.x)
+    seen = [np.less_equal(a, a) for a in z]
+    y = near(linear.y, z, periods)
+    y = [np.where(there, a - b, 0.0) for there, a, b in zip(seen, z, y, strict=True)]
+    read = []
+    for there, row in zip(seen, beside(M, linear.AF), strict=True):
+        read.append([np.where(there, a, 0.0) for a in row])
+    columns = len(M[0])
+    W = read + beside(zeros(n, columns), state.F)
+    W += beside(zeros(n, columns), unit(n)) if smooths else []
+    both = lower(W, m + n)
+    L = [row[:m] for row in both[:m]]
+    e: Vector = []
+    for i, (there, row) in enumerate(zip(seen, L, strict=True)):
+        rest = y[i] - dot(row[:i], e)
+        e.append(np.where(there, rest, 0.0) / np.where(there, row[i], 1.0))
+    after = both[m : m + n]
+    x = plus(state.x, [row[:m] for row in after], e)
+    F = [row[m : m + n] for row in after]
+    doubt = _doubt(state, linear.A, [row[:columns] for row in read])
+    return Update(State(x, F), e, L, doubt, both[m + n :])
+
+
+def _doubt(state: State, H: Rows, M: Rows) -> Number:
+    sizes = []
+    for x, row in zip(state.x, state.F, strict=True):
+        sizes.append(np.maximum(dot(row, row), _HIDDEN * (x * x)))
+    most: Number = 0.0
+    for slopes, noise in zip(H, M, strict=True):
+        read = dot([a * a for a in slopes], sizes)
+        own = dot(noise, noise)
+        none = np.less_equal(own, 0.0)
+        most = np.maximum(most, np.where(none, 0.0, read) / np.where(none, 1.0, own))
+    return most
+
+
+def scores(e: Vector, L: Rows) -> tuple[Number, Number]:
+    """Computes the NIS and the log likelihood of normalised innovations."""
+    nis = dot(e, e)
+    pivots = [row[i] for i, row in enumerate(L)]
+    sizes = [np.where(np.less_equal(one, 0.0), 1.0, 2 * np.pi * one * one) for one in pivots]
+    return nis, -0.5 * reduce(add, map(np.log, sizes), nis)
+
+
+class Smoothed(NamedTuple):
+    """Holds states x + F (u + S w), w ~ N(0, I), given all readings, of those x + F v with
+    v ~ N(0, I) that a filter has."""
+
+    u: Vector
+    S: Rows
+
+    def of(self, state: State) -> State:
+        return State(plus(state.x, state.F, self.u), lower(product(state.F, self.S)))
+
+    def before(self, e: Vector, read: Rows, moved: Rows) -> Smoothed:
+        """Returns the same of the epoch before, by what an update and a transition told."""
+        m = len(e)
+        n = len(self.u)
+        X, Y, Z = ([row[a:b] for row in read] for a, b in ((0, m), (m, m + n), (m + n, m + 2 * n)))
+        u = plus(plus([0.0] * n, X, e), Y, self.u)
+        S = lower(beside(product(Y, self.S), Z))
+        X = [row[:n] for row in moved]
+        Y = [row[n:] for row in moved]
+        return Smoothed(plus([0.0] * n, X, u), lower(beside(product(X, S), Y)))
