@@ -23,7 +23,7 @@ from typing import Any
 
 import pandas as pd
 from gallery_frames import SUFFIX, Computed, read
-from readme import write_readme
+from readme import PICTURES, write_readme
 from shared import oracles
 from state_tables import with_tables
 from word_drawings import write_drawings
@@ -145,6 +145,7 @@ def build(output: Path, trials: int) -> int:
     write_drawings(source)
     write_tables(source)
     write_gallery(source / "gallery", output / "results", trials)
+    shutil.copyfile(PICTURES[0], source / "gallery" / "pictures" / "success.png")
     places = (output / "html", output / "doctrees")
     site = Sphinx(source, None, *places, "html", SETTINGS, warningiserror=True, freshenv=True)
     site.build()

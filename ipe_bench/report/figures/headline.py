@@ -4,6 +4,7 @@ the curves; README shows it, on white and on a dark page."""
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -200,7 +201,7 @@ def _title(figure: Canvas, rows: pd.DataFrame, soft: str) -> None:
     listed: Any = rows.to_dict("records")
     found = Finding.of(listed).sentence().partition(" (")[0].partition("; ")[0]
     # The picture may show some of the estimators alone.
-    found = found.removeprefix("Only ")
+    found = re.sub(r"^(?:Of these \d+, only|Only) ", "", found)
     lines = textwrap.wrap(found, _LONGEST)[:2]
     size = _TITLE if len(lines) == 1 else _TITLE - 3
     heading: Any = {"fontsize": size, "fontweight": "bold", "va": "top", "linespacing": 1.1}
