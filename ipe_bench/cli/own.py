@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import say_files, show
 from ipe_bench.cli.keys import of
 from ipe_bench.cli.shorts import Short
@@ -21,6 +22,8 @@ _TRIALS = 200
 """Data sets that are simulated unless trials= says otherwise."""
 _LOGS = 100
 """Logs likewise."""
+_FEWEST = 20
+"""Fewest of either that say anything of shares."""
 _WITHOUT_MEANING = (*of("run", "figures"), TRUTH, "find", "experiment")
 
 
@@ -30,6 +33,9 @@ def own_command(short: Short) -> int:
     choice = [f"{group}=[{','.join(names)}]" for group, names in standard.OF_OWN.items()]
     asked = single("run", short.words, choice)
     asked.words.refuse(_WITHOUT_MEANING, "has no meaning with a model and readings of your own")
+    trials = asked.spec.trials
+    if trials is not None and trials < _FEWEST:
+        raise UserError(f"trials={trials}: are too few to know shares by; give at least {_FEWEST}")
     if asked.spec.state_model is None:
         found, folder = _of_constants(asked, short.readings)
     else:

@@ -131,11 +131,20 @@ def _require_pair(
         example = f"ipe-bench {command} {_shown(models[0])} readings.csv"
         raise UserError(f"{models[0]}: is a model without readings; add their file: {example}")
     if files and not models and keys.isdisjoint(_MODELS):
+        _refuse_bare_names(others)
         raise UserError(
             f"{files[0]}: holds readings, and no model is given; write a function's file, a formula"
             f' in quotes or a YAML file before it: ipe-bench {command} "a*exp(-b*t)+c" {files[0]},'
             " or choose measurement=NAME"
         )
+
+
+def _refuse_bare_names(words: Sequence[str]) -> None:
+    """Refuses the name of a model without its key."""
+    for word in words:
+        for group in _MODELS:
+            if word in [option.name for option in plugins.options(group)]:
+                raise UserError(f"{word}: is not KEY=VALUE; write {group}={word}")
 
 
 def _shown(model: str) -> str:
@@ -254,6 +263,13 @@ class _Reader:
             if one.arg not in typed
         }
         what = f"{chosen.name}({', '.join(one.arg for one in arguments)})"
+        for column in self._free(wanted):
+            if column in starts:
+                raise UserError(
+                    f"{file}: the argument {column} of {what} has a default, which makes it a"
+                    f" parameter, and {self.files[0]} has a column {column}; remove the default, or"
+                    f" leave the column out by ignore_columns=[{column}]"
+                )
         absent = [column for column in wanted if column not in self.columns]
         if absent:
             free = self._free([*wanted, "reading"])
@@ -265,7 +281,7 @@ class _Reader:
         reading = self._reading(what, wanted, ["reading"])
         words = ["measurement=function", f"measurement.of={module}:{chosen.name}"]
         words += _reading_word(reading, ("reading",))
-        model = f"Model: {what} of {file}; start {_values(starts)}."
+        model = f"Model: {what} of {file}{_values(starts)}."
         return self._short(words, [model, self._told(wanted, reading), self._noise()])
 
     @property
@@ -335,7 +351,8 @@ def _reading_word(reading: str, usual: Sequence[str]) -> list[str]:
 
 
 def _values(starts: dict[str, str]) -> str:
-    return ", ".join(f"{name} = {value}" for name, value in starts.items()) or "as typed"
+    listed = ", ".join(f"{name} = {value}" for name, value in starts.items())
+    return f"; start {listed}" if listed else ""
 
 
 def _parsed(file: str) -> ast.Module:

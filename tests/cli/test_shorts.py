@@ -18,6 +18,7 @@ FILES = {
     "none.py": "x = 3\n",
     "two.py": "def f(t, a=1.0):\n    return a * t\n\n\ndef g(t, a=1.0):\n    return a + t\n",
     "helped.py": "def _half(t):\n    return t / 2\n\n\ndef f(t, a=1.0):\n    return a * _half(t)\n",
+    "timed.py": "def f(t=0.0, a=1.0):\n    return a * t\n",
     "broken.py": "def f(t, a=1.0:\n    return a\n",
     "car.yaml": "next: {x: x + w}\nnoise: {w: 0.1}\nreadings: {z: x}\ndeviation: {z: 0.5}\n"
     "spread: {x: 2}\n",
@@ -99,6 +100,8 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
         (["a*exq(t)", "line.csv"], "exq(...): there is no such function; did you mean exp?"),
         (["a*tt+b", "line.csv"], "column t is not in the formula of a, tt, b"),
         (["a*tt+b", "volt.csv"], "one of them has the readings"),
+        (["timed.py", "falling.csv"], "the argument t of f(t, a) has a default, which makes it"),
+        (["gins", "line.csv"], "gins: is not KEY=VALUE; write measurement=gins"),
         (["t+y", "line.csv"], "no column is left for the readings"),
         (["red.yaml", "log.csv"], "is no model: it has neither next:"),
         (["/usr/falling.py", "falling.csv"], "there is no such file"),

@@ -171,7 +171,6 @@ def own_parts(name: str, own: Own) -> Iterator[Part]:
     yield from sentences(own)
     for number, point in enumerate(own.points):
         yield _table(name, own, point, number)
-    yield _meaning(own)
 
 
 def _table(name: str, own: Own, point: Point, number: int) -> Table:
@@ -191,7 +190,10 @@ def _table(name: str, own: Own, point: Point, number: int) -> Table:
         texts("cost", [compact(one.cost) for one in claims]),
         texts("time", [duration(one.seconds, 2) for one in claims]),
     ]
-    return Table(f"own_{number + 1}" if number else "own", f"{name}: {where}", "", columns)
+    title = f"{name}: {where}"
+    if number:
+        return Table(f"{NAME}_{number + 1}", title, "", columns)
+    return Table(NAME, title, "", columns, notes=[_meaning(own)])
 
 
 def _shares(claims: Sequence[Claim], key: str) -> list[str]:
@@ -242,12 +244,6 @@ def frame(own: Own) -> pd.DataFrame:
 
 def write_own(folder: Path, name: str, own: Own) -> list[Path]:
     """Writes the page, and own.csv with a row per truth and estimator; returns the files."""
-    tables = [one for one in own_parts(name, own) if isinstance(one, Table)]
-    return write_files(
-        folder,
-        NAME,
-        (TABLE, frame(own)),
-        headline(own),
-        list(sentences(own)),
-        [*tables, _meaning(own)],
-    )
+    tables = [_table(name, own, point, number) for number, point in enumerate(own.points)]
+    title = headline(own)
+    return write_files(folder, NAME, (TABLE, frame(own)), title, list(sentences(own)), tables)

@@ -18,7 +18,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, deviations
 from ipe_bench.basics.streams import numbered
 from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
-from ipe_bench.measurements.base import Measurement, SubsetModel
+from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount, cost
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.problem import Problem
@@ -185,24 +185,13 @@ def _noise_in_words(problem: Problem) -> str:
     return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
 
 
-def _coordinates(model: Measurement, values: Array) -> Array:
-    """Returns x (n,) of values (n,) in the parameters' own units."""
-    while isinstance(model, SubsetModel):
-        model = model.whole
-    if isinstance(model, ConstrainedModel):
-        return model.inner(values)
-    return values / model.sizes
-
-
 def _truths(fit: Fit, examination: Examination | None, problem: Problem) -> list[_Truth]:
     """Lists the minima that fit, the least first and each curve once."""
     model = problem.measurement
     estimate = fit.inner[: model.n]
     places = [estimate]
     if examination is not None:
-        minima = [
-            _coordinates(model, one.x[: model.n]) for one in examination.minima if one.as_good
-        ]
+        minima = [one.inner[: model.n] for one in examination.minima if one.as_good]
         places = [*minima, estimate] if minima else places
     found: list[_Truth] = []
     for x in places:
