@@ -584,39 +584,6 @@ class RowPrograms:
         return cls(len(x), len(y), values, Program.of(moved, [*along, *saved]))
 
 
-class Recorded(np.ndarray):
-    """An array of expressions, for models that are written for arrays: each function of NumPy is
-    recorded entry by entry."""
-
-    @classmethod
-    def of(cls, expressions: Sequence[Expression]) -> Recorded:
-        """Makes a stack of one row (1, n)."""
-        return np.array([expressions], dtype=object).view(cls)
-
-    def __array_ufunc__(
-        self, ufunc: np.ufunc, method: str, *inputs: Any, out: Any = None, **kwargs: Any
-    ) -> Any:
-        # NumPy's own loop over an array of objects applies the operators of each entry.
-        plain = [np.asarray(one, dtype=object) for one in inputs]
-        if method != "__call__" or ufunc.signature:  # sums and matrix products, of operators
-            return np.asarray(getattr(ufunc, method)(*plain, **kwargs)).view(Recorded)
-        if kwargs:
-            raise TypeError(f"np.{ufunc.__name__} with {', '.join(kwargs)} cannot be recorded")
-        found = np.asarray(np.frompyfunc(ufunc, len(plain), 1)(*plain), dtype=object).view(Recorded)
-        if out is None:
-            return found
-        out[0][...] = found
-        return out[0]
-
-    def __array_function__(
-        self, function: Any, types: Any, args: tuple[Any, ...], kwargs: Any
-    ) -> Any:
-        if function is np.where and len(args) == 3:
-            plain = [np.asarray(one, dtype=object) for one in args]
-            return np.asarray(np.frompyfunc(np.where, 3, 1)(*plain), dtype=object).view(Recorded)
-        return super().__array_function__(function, types, args, kwargs)
-
-
 def _fusion(
     e: Expression, uses: Mapping[int, int], inputs: Collection[Expression]
 ) -> tuple[str, Expression, Expression] | None:

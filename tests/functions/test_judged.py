@@ -325,6 +325,25 @@ def test_a_model_that_has_changed_is_tracked_as_it_stands(change, tracker, monke
     np.testing.assert_array_equal(after.log_likelihood, wanted.log_likelihood)
 
 
+class Folded(Ship):
+    """Reads a distance by a root that has no slope of its own at the mean of the prior: 0 / 0."""
+
+    name = "folded"
+
+    def observe(self, x, k):
+        return np.sqrt(x[..., :1] ** 2)
+
+
+def test_a_recording_without_a_slope_at_the_mean_is_not_taken():
+    model = Folded()
+    h = model.epoch_functions[1]
+    assert "other slopes" in h.why
+    assert "runs in Python" in model.remarks()[0]
+    slope = h.at[0].slope(np.array([[0.0, 1.0], [2.0, 1.0], [-1.0, 0.0]]))[1]
+    np.testing.assert_allclose(slope[1:, 0], [[1, 0], [-1, 0]], atol=1e-8)
+    assert np.isfinite(ekf().track(model, model.draw(0, 3).z).mean).all()
+
+
 class Stripped(Ship):
     """Takes a root, where np.asarray hides from the recorder that 0 replaces NaN: at states that
     the prior does not show."""
