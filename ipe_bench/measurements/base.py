@@ -13,10 +13,11 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, nearest
 from ipe_bench.basics.options import Component
 from ipe_bench.functions.differences import by_differences
-from ipe_bench.functions.judged import by_complex_steps, widest_steps
+from ipe_bench.functions.judged import Judged, by_complex_steps, widest_steps
 
 Epochs = tuple[NDArray[np.intp], ...]
 
@@ -272,8 +273,29 @@ class Measurement(Component, ABC):
         """Computes dh/dx: (trials, n) -> (trials, m, n); complex step where analytic, else
         differences that know their error."""
         if self.analytic:
+            self._require_analytic()
             return by_complex_steps(self.simulate, x)
         return by_differences(self.simulate, x, self.widest_steps, self.near)
+
+    def _require_analytic(self) -> None:
+        """Raises UserError, at the first Jacobian, if complex steps do not find slopes that
+        differences find near the nominal point."""
+        if self._is_analytic:
+            return
+        raise UserError(
+            f"measurement={self.name}: `analytic` is set, and complex steps do not find the slopes"
+            " of simulate, as behind np.abs or np.maximum; leave `analytic` out"
+        )
+
+    @cached_property
+    def _is_analytic(self) -> bool:
+        offsets = np.random.default_rng(1).uniform(-0.3, 0.3, (4, self.n))
+        x = self.nominal + np.vstack([np.zeros(self.n), offsets])
+        with np.errstate(all="ignore"):
+            J = by_complex_steps(self.simulate, x)
+            own = Judged(self.simulate, self.widest_steps, self.near)
+            wrong = own.wrong(x, self.simulate(x), J)
+        return not (wrong & np.isfinite(J).all(axis=(1, 2))).any()
 
     @cached_property
     def widest_steps(self) -> Array:

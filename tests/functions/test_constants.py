@@ -14,6 +14,7 @@ import pytest
 from shared.slopes import differentiate
 
 import ipe_bench as ib
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Measurement, Parameter, function
 
 CORNER = np.array([500000.0, 5400000.0])
@@ -139,3 +140,19 @@ class Ranges(Measurement):
 def test_an_own_class_without_slopes_has_those_of_its_readings():
     found = Ranges().jacobian(np.array([[500013.0, 5400011.0]]))[0]
     np.testing.assert_allclose(found, slopes_of_ranges(500013.0, 5400011.0), rtol=1e-6)
+
+
+@dataclass(frozen=True)
+class Folded(Ranges):
+    """One that takes absolute values for analytic."""
+
+    analytic = True
+    nominal: Any = (2.0, 3.0)
+
+    def simulate(self, x):
+        return np.abs(x[:, :1]) * x[:, 1:] ** np.arange(1, 6)
+
+
+def test_an_own_class_that_is_not_analytic_is_refused_where_it_says_so():
+    with pytest.raises(UserError, match="leave `analytic` out"):
+        Folded().jacobian(np.array([[2.0, 3.0]]))

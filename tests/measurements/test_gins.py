@@ -11,13 +11,13 @@ from scipy.integrate import DOP853
 from scipy.stats import chi2
 from shared.gins_reference import velocities
 from shared.oracles import agreed, assert_agrees
+from shared.slopes import differentiate
 
 from ipe_bench.api import run
 from ipe_bench.baselines import GaussNewton, LinearLSE
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.main import main
 from ipe_bench.measurements import Gins, Polynomial, RicherGins, SubsetModel
-from ipe_bench.measurements.base import differentiate
 from ipe_bench.noise import Gaussian, NoNoise, Quantization
 from ipe_bench.solvers import FixedPoint, Progressive
 from ipe_bench.trials.scenario import Scenario
