@@ -14,7 +14,7 @@ from functools import cached_property
 from itertools import takewhile
 from typing import Any
 
-from ipe_bench.report.words import percent, value_text
+from ipe_bench.report.words import enumerate_few, percent, value_text
 from ipe_bench.statistics.intervals import LEVEL, clopper_pearson
 from ipe_bench.statistics.verdicts import OVERCONFIDENT
 from ipe_bench.trials.thresholds import HELD
@@ -28,6 +28,8 @@ MEANING = f"Succeeds: in at least {100 * HELD:.0f} % of trials, with 95 % confid
 SUCCEEDS = "succeeds"
 FAILS = "fails"
 UNDECIDED = "undecided"
+_PRIOR = "prior"
+"""What some estimators of constants are given besides the readings."""
 _SIDES = ("filters", "IPE")
 """The families whose best are named if they part."""
 
@@ -51,6 +53,10 @@ class Standing:
     @property
     def family(self) -> str:
         return next((str(row.get("family", "")) for row in self.rows if row), "")
+
+    @property
+    def given(self) -> str:
+        return next((str(row.get("given", "")) for row in self.rows if row), "")
 
     @cached_property
     def sure(self) -> int:
@@ -120,6 +126,14 @@ class Finding:
         return self.standings[0].ascending
 
     @property
+    def across(self) -> str:
+        """Names those that were given the prior, and others were not; empty if there are none."""
+        more = [one.label for one in self.standings if one.given == _PRIOR]
+        if len(more) in (0, len(self.standings)):
+            return ""
+        return f"Also given the prior of the truth: {enumerate_few(more, 8)}."
+
+    @property
     def leading(self) -> list[bool]:
         """Whether no estimator significantly holds longer, or in more settings, than each; of none
         if this is so of all."""
@@ -144,7 +158,9 @@ class Finding:
     def _winners(self, winners: Sequence[Standing], undecided: Sequence[Standing]) -> str:
         who = named(winners, self.standings)
         if len(winners) < len(self.standings) and not undecided:
-            who = f"Only {who}"
+            number = len(self.standings)
+            is_counted = len(winners) > MOST_NAMES
+            who = f"Only {who}" if is_counted else f"Of these {number}, only {who}"
         verb = "succeeds" if len(winners) == 1 else "succeed"
         who = who.replace("all ", "All ", 1) if who.startswith("all ") else who
         return f"{who} {verb} {self._where(winners)} ({self._numbers(winners)})"

@@ -38,7 +38,7 @@ def found(rows: list[dict[str, Any]]) -> str:
 def test_only_the_one_that_holds_is_named_and_where_the_best_filter_fails():
     rows = sweep(newton=(200, 200, 200), ekf=(200, 90, 0), ukf=(200, 20, 0), lse=(0, 0, 0))
     assert found(rows) == (
-        "Only newton succeeds up to error scale 100 (100 % of 200 trials);"
+        "Of these 4, only newton succeeds up to error scale 100 (100 % of 200 trials);"
         " ekf and ukf fail from 10 on"
     )
     assert [one.label for one in Finding.of(rows).standings] == ["newton", "ekf", "ukf", "lse"]
@@ -61,7 +61,7 @@ def test_a_share_seen_above_the_level_is_no_proof():
 
 def test_who_holds_longest_is_named_with_the_scale_up_to_which():
     assert found(sweep(a=(200, 198, 0), b=(200, 100, 0))) == (
-        "Only a succeeds up to error scale 10 (99 % of 200 trials)"
+        "Of these 2, only a succeeds up to error scale 10 (99 % of 200 trials)"
     )
 
 
@@ -80,7 +80,7 @@ def test_all_hold_and_more_than_three_are_counted():
 def test_one_scale_and_one_estimator():
     assert found(sweep(a=(200,))) == "a succeeds at error scale 1 (100 % of 200 trials)"
     assert found(sweep(a=(200,), ekf=(3,), newton=(5,))) == (
-        "Only a succeeds at error scale 1 (100 % of 200 trials); ekf and newton fail"
+        "Of these 3, only a succeeds at error scale 1 (100 % of 200 trials); ekf and newton fail"
     )
 
 
@@ -136,13 +136,13 @@ def settings(**counts: tuple[int, ...]) -> list[dict[str, Any]]:
 
 def test_settings_are_counted_and_have_no_order():
     assert found(settings(a=(0, 200, 200), b=(200, 0, 0))) == (
-        "Only a succeeds in 2 of 3 settings, all but truth=0 (100 % of 200 trials)"
+        "Of these 2, only a succeeds in 2 of 3 settings, all but truth=0 (100 % of 200 trials)"
     )
     assert found(settings(a=(200, 200), b=(200, 196))) == (
         "a and b succeed in both settings (98 to 100 % of 200 trials)"
     )
     assert found(settings(a=(178, 200), b=(0, 0))) == (
-        "Only a succeeds in at least 1 of 2 settings (100 % of 200 trials)"
+        "Of these 2, only a succeeds in at least 1 of 2 settings (100 % of 200 trials)"
     )
     assert found(settings(a=(0, 0))) == (
         "No estimator succeeds in any setting; a succeeds in 0 % of 200 trials in 2 settings"
@@ -166,8 +166,8 @@ def test_few_scenarios_that_are_lost_are_named_and_their_number_is_told_once():
     for one in rows[:4]:
         one["verdict"] = "overconfident"
     assert found(rows) == (
-        "Only auto succeeds in 3 of 4 scenarios, all but pendulum at 10 (100 % of 200 trials);"
-        " its covariance is too small in 4 scenarios"
+        "Of these 2, only auto succeeds in 3 of 4 scenarios, all but pendulum at 10 (100 % of 200"
+        " trials); its covariance is too small in 4 scenarios"
     )
 
 

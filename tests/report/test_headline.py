@@ -72,7 +72,7 @@ def test_the_headline_says_who_holds_who_agrees_and_who_fails_undetected(synthet
     finding, matrix, agree, price, silent = headline(analysis)
     assert [row[0].text for row in matrix.rows] == ["solver", "filter"]
     assert finding == (
-        "Only solver succeeds up to error scale 1000 (100 % of 100 trials);"
+        "Of these 2, only solver succeeds up to error scale 1000 (100 % of 100 trials);"
         " filter fails from 100 on, with covariances that are too small from 10 on"
     )
     assert agree.startswith(
@@ -117,7 +117,9 @@ def test_several_settings_are_counted_and_the_worst_is_named(synthetic):
         )
     finding, matrix, silent = said(synthetic.directory)
     assert matrix == "matrix"
-    assert finding.startswith("Only good succeeds in both settings (100 % of 50 trials)")
+    assert finding.startswith(
+        "Of these 2, only good succeeds in both settings (100 % of 50 trials)"
+    )
     assert silent == (
         "Undetected failures: up to 40 % of the trials (bad at error scale 1, noise.deviation=0.2)."
     )
@@ -238,11 +240,11 @@ def finding_is_so(sentence: str, results: Results) -> None:
         assert sentence.startswith("No") == (not any(possible.values()))
         return
     first, *others = sentence.split("; ")
-    who = re.match(r"(?:Only )?(.*?) succeeds? ", first)
+    who = re.match(r"(?:Of these \d+, only |Only )?(.*?) succeeds? ", first)
     assert who
     if who[1] != f"All {len(winners)} estimators" and " of " not in who[1]:
         assert set(re.split(", | and ", who[1])) == winners
-    assert first.startswith("Only") == (not rivals and len(winners) < len(sure))
+    assert first.startswith(("Only", "Of these")) == (not rivals and len(winners) < len(sure))
     told = [other for other in others if re.fullmatch(r"(?!at )[^:]*: undecided", other)]
     named = [set(re.split(", | and ", one.removesuffix(": undecided"))) for one in told]
     assert named == ([rivals] if rivals else [])

@@ -125,7 +125,8 @@ NAMED = (
 NUMBERS = r"(?P<low>[<>\d.]+)(?: %)?(?: to (?P<high>[<>\d.]+))? % of (?P<trials>\d+) trials"
 UP_TO = r"(?:up to|at) error scale (?P<scale>[\d.]+)"
 CLAUSES = {
-    "winners": rf"(?P<only>Only )?{NAMED} succeeds? {UP_TO} \({NUMBERS}\)",
+    "winners": r"(?P<only>Only |Of these (?P<field>\d+), only )?"
+    rf"{NAMED} succeeds? {UP_TO} \({NUMBERS}\)",
     "covariance": rf"(?:(?P<theirs>its|their) covariance|the covariance of {NAMED}) is too small"
     r"(?: (?P<extent>from|at) (?P<scale>[\d.]+)(?: on)?)?",
     "undecided": rf"{NAMED}: undecided",
@@ -135,7 +136,7 @@ CLAUSES = {
     r"(?:, even at error scale (?P<even>[\d.]+))?",
     "most": rf"{NAMED} succeeds? in {NUMBERS} {UP_TO}",
 }
-FINDING = r"(?:Only |All |No estimator |Too few |\d+ of \d+ |e\d+).*(?:succeed|to rank).*"
+FINDING = r"(?:Only |Of these |All |No estimator |Too few |\d+ of \d+ |e\d+).*(?:succeed|to rank).*"
 
 
 @sentence(FINDING)
@@ -213,6 +214,8 @@ def they_hold(report: Report, found: Any, winners: list[str]) -> Iterator[tuple[
     yield "numbers of winners", COUNTS, not numbers_are_so(report, found, winners, at)
     yield "holds", INFERS, not all(truly_holds(report, e, at) for e in winners)
     others = [e for e in drawn.populations if e not in winners]
+    if found["field"]:
+        yield "the field", COUNTS, int(found["field"]) != len(drawn.populations)
     if found["only"]:
         yield "only", INFERS, any(truly_holds(report, e, at) for e in others)
 

@@ -344,7 +344,16 @@ def _analysis(drawn: Board, collection: Any, samples: Mapping[tuple[int, str], S
         pairs += [where | pair for pair in compare_pairs(outcomes)]
     none = pd.DataFrame()
     held = dict.fromkeys(
-        ("endings", "distributions", "convergence", "calibration", "contraction", "tracks"), none
+        (
+            "endings",
+            "distributions",
+            "convergence",
+            "calibration",
+            "contraction",
+            "tracks",
+            "one_track",
+        ),
+        none,
     )
     frames = {
         "summary": pd.DataFrame(summary),

@@ -108,7 +108,7 @@ class Matrix(Table):
     captions: Sequence[str] = ()
     """What its figure says of letters, numbers and signs."""
     letters: Sequence[str] = ()
-    """What letters in place of long titles stand for."""
+    """What letters in place of long titles stand for, and who had the prior."""
     ends: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
     """The worst, a middle and the best number of each view."""
     moving: bool = False
@@ -157,8 +157,13 @@ class Matrix(Table):
 
 def opening(rows: Sequence[Row], lines: float = math.inf) -> list[Part]:
     """Returns the finding and its matrices, of several as many as those lines have room for."""
-    shown = matrices(rows, lines) or [MEANING]
-    return [Strong(Finding.of(rows).sentence()), *shown]
+    finding = Finding.of(rows)
+    shown = matrices(rows, lines)
+    if shown and finding.across:
+        last = shown[-1]
+        notes = [*last.notes, finding.across]
+        shown[-1] = replace(last, notes=notes, letters=[*last.letters, finding.across])
+    return [Strong(finding.sentence()), *(shown or [MEANING])]
 
 
 def matrices(rows: Iterable[Row], lines: float = math.inf) -> list[Matrix]:

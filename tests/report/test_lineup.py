@@ -1,0 +1,67 @@
+"""Comparisons that the site shows contain the strongest of each family: who that is, stored results
+say."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from gallery_frames import SUFFIX, read
+from make_docs import STORED
+
+from ipe_bench.basics.files import own_conf
+from ipe_bench.report.finding import Finding
+from ipe_bench.statistics.records import family_of
+
+EXPERIMENTS = own_conf() / "experiment"
+APART = {
+    "paper": "the paper's two estimates, which its title counts",
+    "nist": "certified readings, without a prior for filters",
+    "pendulum_book": "published errors of twelve trackers",
+}
+"""Experiments that compare nobody else, and why."""
+
+
+def strongest(experiment: str, column: str) -> dict[str, str]:
+    """Returns the best estimator of the stored experiment in each family, or by what it is given,
+    as the finding ranks them."""
+    analysis = read(STORED / f"{experiment}{SUFFIX}").analysis
+    footers = {one.estimator: one.footer for one in analysis.collection.groups}
+    rows: Any = analysis.totals
+    kinds = {label: family_of(footer) for label, footer in footers.items()}
+    rows = rows.assign(setting=rows["measurement"], family=rows["estimator"].map(kinds))
+    families = rows.groupby(column, sort=False)
+    return {
+        str(family): Finding.of(own.to_dict("records")).standings[0].label
+        for family, own in families
+    }
+
+
+def compared(path: Path) -> set[str]:
+    """Returns the estimators, or trackers, of an experiment."""
+    defaults = yaml.safe_load(path.read_text(encoding="utf-8"))["defaults"]
+    chosen = [one for one in defaults if isinstance(one, dict)]
+    groups = ("override /solver", "override /baseline", "override /tracker")
+    return {name for one in chosen for group in groups for name in one.get(group, ())}
+
+
+@pytest.mark.parametrize("path", sorted(EXPERIMENTS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_an_experiment_contains_the_strongest_of_each_family(path):
+    if path.stem in APART:
+        return
+    if path.stem == "states":
+        assert compared(path) >= {*strongest("states", "given").values(), "iplf", "iekf"}
+        return
+    best = strongest("beyond", "family")
+    assert set(best) >= {"IPE", "least squares", "filters"}
+    assert compared(path) >= {best["least squares"], best["filters"]}
+    assert compared(path) >= {"multistart", "map_lm", "iterated_ekf", "iplf"}
+
+
+def test_a_title_with_only_names_its_field():
+    rows: Any = read(STORED / f"paper{SUFFIX}").analysis.totals
+    said = Finding.of(rows.to_dict("records")).sentence()
+    assert re.match(r"Of these 2, only fixed_point succeeds up to ", said)
