@@ -307,11 +307,8 @@ def test_problems_in_common_alone_are_counted():
 
 FEW = r"Too few trials to rank; .* succeed in 100 % of 20 trials"
 SWEEP = (rf"{FEW} at error scale 1", "matrix")
-RIVALS = (
-    rf"{FEW} at error scale 300",
-    "matrix",
-    r"Small errors: IPE \(.*\) and filters \(.*\) perform alike at every error scale",
-)
+ALIKE = r"Small errors: IPE \(.*\) and filters \(.*\) perform alike at every error scale"
+RIVALS = (rf"{FEW} at error scale 300", "matrix", ALIKE)
 PAGES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "nist": (
         ("measurement.dataset=Misra1a,BoxBOD", "measurement.start=2"),
@@ -320,10 +317,11 @@ PAGES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "pendulum_book": ((), (r"All 2 published errors are met, to \d\.\de-1\d at worst\.",)),
     "mismatch": ((), (rf"{FEW} in 5 settings", "matrix")),
     **dict.fromkeys(("headline", "filters", "beyond"), (("error_scale=1,300",), RIVALS)),
+    "paper": (("error_scale=0.1,1",), SWEEP),
     **dict.fromkeys(
-        ("paper", "bearings", "ranging", "polynomial"), (("error_scale=0.1,1",), SWEEP)
+        ("bearings", "ranging", "polynomial", "lotka_volterra"),
+        (("error_scale=0.1,1",), (*SWEEP, ALIKE)),
     ),
-    "lotka_volterra": (("error_scale=0.1,1",), SWEEP),
     "states": (
         ("state_model=bearings_only", "error_scale=1,10"),
         (
