@@ -3,7 +3,7 @@ and of two answers that fit by construction."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,8 @@ def asked(formula: str, start: dict[str, float], z: Any, **stated: Any) -> Quest
 
 
 def line(noise: Any = None, **stated: Any) -> Question:
-    z = 3.0 + 0.5 * T + 0.2 * np.random.default_rng(3).standard_normal(len(T))
+    """Six readings: with four degrees of freedom the law of the level counts."""
+    z = 3.0 + 0.5 * T[:6] + 0.2 * np.random.default_rng(3).standard_normal(6)
     return asked("a*t + b", {"a": 1.0, "b": 1.0}, z, noise=noise, **stated)
 
 
@@ -45,7 +46,7 @@ def test_intervals_of_a_line_hold_the_truth_in_95_percent(noise: Any) -> None:
         # The worse of two shares with a standard deviation of .7 %.
         assert 0.925 < one.holds < 0.965
         assert one.factor == pytest.approx(1.0, abs=0.12)
-    slope = np.polyfit(T, line().found.z, 1)
+    slope = np.polyfit(T[:6], line().found.z, 1)
     np.testing.assert_allclose([point.at["a"], point.at["b"]], slope, rtol=1e-6)
 
 
@@ -77,10 +78,27 @@ def test_two_answers_that_fit_are_both_truths() -> None:
     assert any(one.startswith("BUT your data have 2 answers that fit") for one in sentences(found))
 
 
+@dataclass(frozen=True)
+class Turned(ib.Estimator):
+    """Gives the answer of least squares with the other sign in every second trial."""
+
+    def estimate(self, problem: Any, z: Any, *, history: bool = False) -> ib.Estimates:
+        found = ib.baselines.LevenbergMarquardt().estimate(problem, z)
+        found.x[::2] *= -1
+        return found
+
+
+def test_a_minimum_that_does_not_fit_is_no_truth() -> None:
+    """A cosine has a minimum for each of many frequencies, and one of them fits."""
+    z = np.cos(0.5 * np.arange(30.0)) + 0.1 * np.random.default_rng(1).standard_normal(30)
+    found = own(asked("cos(w*t)", {"w": 0.52}, z), LEAST_SQUARES, 20)
+    assert [point.at["w"] for point in found.points] == [pytest.approx(0.5, abs=0.01)]
+
+
 def test_copies_of_the_same_curve_count_as_found() -> None:
     """The sign of a is open in a^2 t; every answer has the right curve and the right bars."""
     z = 4.0 * T + 0.3 * np.random.default_rng(1).standard_normal(len(T))
-    found = own(asked("a**2 * t", {"a": -3.0}, z), {"lm": ib.baselines.LevenbergMarquardt()}, 300)
+    found = own(asked("a**2 * t", {"a": -3.0}, z), {"turned": Turned()}, 300)
     (point,) = found.points
     assert point.at["a"] == pytest.approx(-2.0, abs=0.05)
     assert point.claims[0].found == 300
