@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import re
 import tomllib
 from pathlib import Path
 
@@ -94,6 +95,40 @@ def test_nothing_is_imported_against_the_line():
                 assert parts[1] == room or parts[1] not in rooms, (
                     f"{path} imports {name}, its neighbour in the line"
                 )
+
+
+PICTURE = re.compile(r"^(\w*) {2,}(\w+) {2,}(\S.*)$", re.MULTILINE)
+
+
+def storeys() -> list[tuple[str, str, str]]:
+    """The picture of plugins/README.md from the ground up: storey, room, and what it does."""
+    readme = (HOUSE.parent / "plugins/README.md").read_text(encoding="utf-8")
+    drawn = readme.partition("## Where things are")[2].split("```")[1].removeprefix("text")
+    storey = ""
+    found = []
+    for named, room, does in PICTURE.findall(drawn):
+        storey = named or storey
+        found.append((storey, room, does))
+    return found[::-1]
+
+
+def test_the_picture_of_the_house_has_every_room_above_those_that_it_imports():
+    place = {room: i for i, (_, room, _) in enumerate(storeys())}
+    assert place.keys() == PLACE.keys()
+    for path, room in MODULES:
+        for name in imported(path, checked_types=True):
+            parts = name.split(".")
+            if parts[0] == "ipe_bench" and len(parts) > 1 and parts[1] in place:
+                assert place[parts[1]] <= place[room], f"{path} imports {name}, drawn above it"
+
+
+def test_the_picture_has_five_storeys_and_names_each_room_in_five_words():
+    assert list(dict.fromkeys(storey for storey, _, _ in storeys())) == [
+        *("ground", "models", "methods", "bench", "answers")
+    ]
+    assert [room for _, room, does in storeys() if len(does.split()) != 5] == []
+    folders = {path.name for path in HOUSE.iterdir() if (path / "__init__.py").is_file()}
+    assert folders <= {room for _, room, _ in storeys()}
 
 
 def test_rooms_know_only_the_libraries_that_are_theirs():
