@@ -24,7 +24,15 @@ PROMISED = {
     for modules, names in ROWS
     for module in re.findall(r"`([\w.]+)`", modules)
 }
-ROOMS_OF_ZOO = {"basics", "measurements", "estimators", "baselines", "statistics", "report"}
+ROOMS_OF_ZOO = {
+    "basics",
+    "measurements",
+    "estimators",
+    "solvers",
+    "baselines",
+    "statistics",
+    "report",
+}
 """What the zoo enters of the package."""
 
 

@@ -368,15 +368,15 @@ CHANGES = {
     "safety-forgotten": Change(
         "engine",
         "the estimate of an integration error is believed to the last digit",
-        "moved = SAFETY * np.maximum(moved, astray / STATES)",
-        "moved = np.maximum(moved, astray / STATES)",
+        "moved = SAFETY * np.maximum(shifts, astray / STATES)",
+        "moved = np.maximum(shifts, astray / STATES)",
         "test_ode_integrator.py test_ode_paths.py test_gins.py",
     ),
     "states-unseen": Change(
         "engine",
         "an integration is judged by its readings alone",
-        "SAFETY * np.maximum(moved, astray / STATES)",
-        "SAFETY * moved",
+        "SAFETY * np.maximum(shifts, astray / STATES)",
+        "SAFETY * shifts",
         "test_stiff.py test_described_cases.py test_ode_paths.py",
     ),
     "stages-at-start": Change(
@@ -389,8 +389,8 @@ CHANGES = {
     "rodas-autonomous": Change(
         "engine",
         "sensitivities of stiff equations forget that rates depend on time",
-        '"dft": (tangent(in_time, along), point + ways)',
-        '"dft": (tangent(in_time, {}), point + ways)',
+        '"dft": Program.of(tangent(in_time, along), point + ways)',
+        '"dft": Program.of(tangent(in_time, {}), point + ways)',
         "test_stiff.py",
     ),
     "line-before-rows": Change(
@@ -908,8 +908,8 @@ CHANGES = {
     "quantiles-shifted": Change(
         "statistics",
         "quantiles had from one sort are no quantiles",
-        "between = a + (b - a) * (position - below)",
-        "between = a + (b - a) + (position - below)",
+        "between = a + (b - a) * beyond",
+        "between = a + (b - a) + beyond",
         "test_intervals.py",
     ),
     "readings-unread": Change(

@@ -142,6 +142,7 @@ def test_the_source_of_a_result_is_in_the_rooms_that_draw_estimate_and_score():
     assert rooms == {
         "basics",
         "engine",
+        "functions",
         "measurements",
         "noise",
         "priors",
