@@ -13,6 +13,7 @@ import itertools
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.basics.errors import StorageError, UserError, describe_exception, unknown
 from ipe_bench.cli import print_problems
 from ipe_bench.cli import words as w
 from ipe_bench.cli.hydra_keys import Guarded
@@ -112,6 +113,10 @@ def _hydra() -> Any:
     return GlobalHydra.instance().hydra
 
 
+_DIED = {"KilledWorker", "UncompletedJobError"}
+"""Exceptions by which Dask and submitit say that a worker is gone; joblib has Python's own."""
+
+
 @dataclass(frozen=True)
 class Jobs:
     """Holds the jobs of a command, each checked."""
@@ -136,6 +141,14 @@ class Jobs:
                 batches = _hydra().multirun(PluginConfigs.name, task, self.words.text)
         except (HydraException, OmegaConfBaseException) as error:
             raise explain(error) from error
+        except Exception as error:
+            name = type(error).__name__
+            if not (isinstance(error, BrokenExecutor) or name in _DIED):
+                raise
+            raise StorageError(
+                f"a worker of the launcher was killed ({name}); earlier results are intact: run the"
+                " same command to resume"
+            ) from None
         return [job.return_value for batch in batches or [] for job in batch]
 
 

@@ -3,6 +3,8 @@ marker and a dash per member, one theme."""
 
 from __future__ import annotations
 
+import importlib
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -311,12 +313,25 @@ def print_width() -> float:
     return _print_width.get()
 
 
+def _seaborn() -> Any:
+    """Imports seaborn without SciPy's statistics, which take longer to load than it does: no figure
+    of ours has the densities that it computes with them, and it has its own."""
+    statistics = "scipy.stats"
+    if statistics not in sys.modules and "seaborn" not in sys.modules:
+        sys.modules[statistics] = None  # type: ignore[assignment]
+        try:
+            importlib.import_module("seaborn")
+        finally:
+            del sys.modules[statistics]
+    return importlib.import_module("seaborn")
+
+
 @contextmanager
 def house_style(scale: float = 0.95, more: Mapping[str, Any] | None = None) -> Iterator[None]:
     """Sets seaborn's white grid in its context of a paper, with letters of this scale."""
     import matplotlib as mpl
-    import seaborn as sns
 
+    sns = _seaborn()
     settings: dict[Any, Any] = {
         **sns.axes_style("whitegrid"),
         **sns.plotting_context("paper", font_scale=scale),

@@ -1,9 +1,11 @@
 """Where Hydra's launchers run the jobs of a sweep changes no number."""
 
+from concurrent.futures import BrokenExecutor
 from importlib.metadata import distributions
 
 import pandas as pd
 import pytest
+from hydra._internal.hydra import Hydra
 
 import ipe_bench as ib
 from ipe_bench.cli.main import main
@@ -94,3 +96,16 @@ def test_a_damaged_file_of_a_sweep_is_computed_once_again(tmp_path, monkeypatch,
     assert main(sweep) == 0
     assert len(list((tmp_path / "out/trials").glob("*.damaged-*"))) == 1
     pd.testing.assert_frame_equal(rows("out"), before, check_exact=True)
+
+
+def test_a_killed_worker_of_a_launcher_is_one_line(tmp_path, monkeypatch, capsys):
+    """That of joblib raises what Python's own pools do."""
+    monkeypatch.chdir(tmp_path)
+
+    def killed(*_: object, **__: object) -> None:
+        raise BrokenExecutor("a worker stopped abruptly")
+
+    monkeypatch.setattr(Hydra, "multirun", killed)
+    assert main(["run", "-m", *SWEEP, "hydra/launcher=basic", "output=out"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("earlier results are intact: run the same command to resume")
