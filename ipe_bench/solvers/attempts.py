@@ -25,9 +25,9 @@ from ipe_bench.measurements.problem import Problem
 
 Rows = NDArray[np.intp]
 
-# Halved or doubled, each plain number here and below leaves 155 of 160 trials solved (one fewer with
-# half of `_LOOKS`), and the cost within 1 %: `python tests/benchmarks/constants.py attempts`. Most of
-# its problems need no further attempt; `_SLOW_GROWTH` and the tuples were not varied.
+# Halved or doubled, each plain number here and below leaves 155 of 160 trials solved, but for one
+# fewer with half of `_LOOKS`, and the cost within 1 %: `python tests/benchmarks/constants.py
+# attempts`. Few of those trials need a further attempt. `_SLOW_GROWTH` and tuples were not varied.
 _LONG = 600
 """Iterations of an attempt from the nominal point, and of one from elsewhere that promises
 something."""
