@@ -15,6 +15,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import generator
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.known import ConstrainedModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.real.fits import FAR_BELOW, Fit, at_rows, falls_beyond, holding, scaled
 from ipe_bench.real.levels import Levelled, maximise_likelihood, maximum, objective_of
@@ -355,6 +356,8 @@ def examine(
         return None
     held_at = best.held_at
     if held_at:
+        if not isinstance(problem.measurement, ConstrainedModel):
+            problem = replace(problem, measurement=ConstrainedModel(problem.measurement, ()))
         problem = holding(problem, held_at)
     rows = np.flatnonzero(np.isfinite(z))
     least = _least_levelled(best, z[rows]) if best.estimated is not None else _least(best, z[rows])
@@ -373,7 +376,8 @@ def examine(
         bootstraps=bootstraps,
         overstated=best.overstated >= FAR_BELOW,
     )
-    if not held_at:
+    # The place of a step has no profile.
+    if not held_at or best.between:
         return found
     outer = Problem(best.model, best.assumed.R)
     return replace(

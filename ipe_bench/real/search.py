@@ -1,10 +1,11 @@
-"""Takes the lower minimum that the examination of an estimate finds as a further estimate."""
+"""Looks for further estimates: at a lower minimum that the examination finds, and at the values of
+columns for parameters at which readings step or bend."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -14,12 +15,16 @@ from ipe_bench.estimators.driver import Limits
 from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.estimators.minima import minimize
+from ipe_bench.measurements.base import Measurement, WrappedModel
+from ipe_bench.measurements.known import ConstrainedModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.real.examination import Examination, examine
-from ipe_bench.real.fits import Fit, compared, fit
+from ipe_bench.real.fits import Fit, compared, fit, holding
 
 LABEL = "search"
+_AT_ONCE = 48
+"""Values of a column that are tried together."""
 _MOST = 3
 """Lower minima that are taken one after another at most."""
 
@@ -51,6 +56,7 @@ def examined(
 ) -> tuple[list[Fit], Examination | None]:
     """Examines the least minimum of the fits to readings z (m,); if that finds a lower one, by more
     than chance explains, the fit there is one of the fits, and is examined."""
+    fits = _with_steps(problem, z, fits, noise)
     found = examine(problem, z, fits)
     for _ in range(_MOST):
         # What is held on a bound has no start inside.
@@ -63,3 +69,115 @@ def examined(
         fits = compared([*before, further])
         found = examine(problem, z, fits)
     return fits, found
+
+
+def _with_steps(problem: Problem, z: Array, fits: list[Fit], noise: Noise) -> list[Fit]:
+    """Adds a fit, if none passes, in which a parameter that moves no reading has the best of the
+    values between those of the columns, as the place of a step has."""
+    told = [one for one in fits if np.isfinite(one.deviance) and not one.with_prior]
+    best = min(told, key=lambda one: one.deviance, default=None)
+    if best is None or best.held_at or best.estimated is not None:
+        return fits
+    if any(one.passes for one in fits):
+        return fits
+    ends = [end for place in best.idle for end in _along_columns(best, place)]
+    if not ends:
+        return fits
+    least = min(ends, key=lambda one: one.squares)
+    place = least.place
+    low, high = least.between
+    x = least.x
+    point = dict(zip([p.name for p in best.model.parameters], x.tolist(), strict=True))
+    (further,) = fit(problem, z, {LABEL: From(point)}, noise)
+    if further.idle:
+        if further.idle != (place,) or not _same_between(further, place, low, high):
+            return fits
+        # The readings step there, and no slope tells where.
+        if not isinstance(problem.measurement, ConstrainedModel):
+            problem = replace(problem, measurement=ConstrainedModel(problem.measurement, ()))
+        middle = (low + high) / 2
+        (step,) = fit(holding(problem, {place: middle}), z, {LABEL: From(point)}, noise)
+        further = replace(
+            step, model=further.model, held_at={place: middle}, between={place: (low, high)}
+        )
+    before = [replace(one, beaten_by="", lower_at="") for one in fits]
+    return compared([*before, further])
+
+
+class _End(NamedTuple):
+    """Holds the least sum of squares with one parameter between two values of a column."""
+
+    place: int
+    squares: float
+    x: Array
+    between: tuple[float, float]
+
+
+def _along_columns(best: Fit, place: int) -> list[_End]:
+    """Finds the sums of squares that are less than that of the fit, each less than the one before,
+    with one parameter between two values of a column."""
+    least = best.chi_square * (1 - 1e-9)
+    found = []
+    for column in _columns(best.model):
+        low = 0
+        high = len(column) - 1
+        # The gap of the column that is best among few, then among those next to it.
+        while high > low:
+            gaps = np.unique(np.linspace(low, high - 1, _AT_ONCE).astype(int))
+            middles = (column[gaps] + column[gaps + 1]) / 2
+            x, squares = _least_with(best, place, middles)
+            k = int(np.nanargmin(squares)) if np.isfinite(squares).any() else 0
+            if squares[k] < least:
+                least = squares[k]
+                between = float(column[gaps[k]]), float(column[gaps[k] + 1])
+                found.append(_End(place, float(squares[k]), x[k], between))
+            if len(gaps) == high - low:
+                break
+            low = gaps[max(k - 1, 0)]
+            high = gaps[min(k + 1, len(gaps) - 1)] + 1
+    return found
+
+
+def _columns(model: Measurement) -> Iterator[Array]:
+    """Yields the different values of each column of numbers, in their order."""
+    for name, column in model.index.items():
+        values = np.unique(np.asarray(column))
+        if name != "row" and np.issubdtype(values.dtype, np.number) and len(values) > 1:
+            yield values.astype(float)
+
+
+def _least_with(best: Fit, place: int, values: Array) -> tuple[Array, Array]:
+    """Minimises the sum of squares from the fit with one parameter at each of the values, and
+    returns where that led to (values, n), with the sums (values,)."""
+    problem = best.assumed
+    x = _placed(best, place, values)
+    with np.errstate(all="ignore"):
+        objective = Objective.of(problem, repeated(best.given.z, len(values)))
+        limits = Limits(1e-6, 100)
+        ended = minimize(objective, LevenbergMarquardtMethod(1e-3), x, limits)
+        squares = np.sum(objective.residual(ended.x) ** 2, axis=1)
+    return ended.x, np.where(np.isfinite(x).all(axis=1), squares, np.inf)
+
+
+def _placed(best: Fit, place: int, values: Array) -> Array:
+    """Returns the fit's parameters (values, n) with one of them at each of the values; not finite
+    outside of its bounds."""
+    model = best.assumed.measurement
+    whole = model
+    while isinstance(whole, WrappedModel) and not isinstance(whole, ConstrainedModel):
+        whole = whole.whole
+    own = model.physical(repeated(best.inner, len(values)))
+    own[:, place] = values
+    with np.errstate(all="ignore"):
+        moved = whole.inner(own) if isinstance(whole, ConstrainedModel) else own / model.sizes
+    x = repeated(best.inner, len(values))
+    x[:, place] = moved[:, place]
+    return x
+
+
+def _same_between(further: Fit, place: int, low: float, high: float) -> bool:
+    """Tells whether readings are the same with one parameter anywhere between two values."""
+    x = _placed(further, place, low + (high - low) * np.linspace(0.001, 0.999, 5))
+    with np.errstate(all="ignore"):
+        h = further.assumed.measurement.simulate(x)
+    return bool((h == h[0]).all())

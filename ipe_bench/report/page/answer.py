@@ -152,8 +152,9 @@ class Answer(Labelled[Fit]):
         one = self.examination
         # Without the parameters that are held on bounds, and the levels.
         model = one.whole.measurement if one else self.model
-        for sentence in model.remarks(one.inner[: model.n] if one else model.nominal):
-            yield f"Note: {sentence}."
+        if not any(fit.between and fit.passes for fit in self.fits):
+            for sentence in model.remarks(one.inner[: model.n] if one else model.nominal):
+                yield f"Note: {sentence}."
         yield _estimates(self)
         yield _verdicts(self)
         yield from _outliers(self)
@@ -367,7 +368,7 @@ def _labels(fits: Iterable[Fit]) -> str:
 
 def _notes_on_fit(one: Fit) -> Iterator[str]:
     if one.label == SEARCH:
-        yield f"{SEARCH}: Levenberg-Marquardt steps from the lowest minimum that more starts found."
+        yield f"{SEARCH}: Levenberg-Marquardt steps from the best of further starts."
     if one.beaten_by:
         yield (
             f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this"
@@ -375,7 +376,14 @@ def _notes_on_fit(one: Fit) -> Iterator[str]:
         )
     if one.lower_at:
         yield f"{one.label}: {one.lower_at} ended at a lower minimum, which is the better answer."
-    if one.held_at:
+    for k, (low, high) in one.between.items():
+        name = one.model.physical_parameters[k].name
+        yield (
+            f"{one.label}: readings step at {name}, and are the same with every value from"
+            f" {low:.6g} to {high:.6g}. It has no standard error, and the errors of the others hold"
+            " it there."
+        )
+    if one.held_at and not one.between:
         parameters = one.model.physical_parameters
         at = {parameters[k].name: value for k, value in one.held_at.items()}
         yield (
