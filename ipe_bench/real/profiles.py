@@ -29,6 +29,8 @@ from ipe_bench.real.levels import objective_of
 CONFIDENCE = 0.95
 _FARTHEST = 1e6
 """Half-widths from standard errors beyond which no end is searched for."""
+_DECADES = 30.0
+"""Decades of a bounded parameter's distance to its bound beyond which no end is searched for."""
 _STRETCHES = 27
 """The most steps outwards."""
 _STRAIGHT = 0.02
@@ -221,9 +223,14 @@ class _Side:
         """Finds the distance to the end; infinite if there is none, NaN if minima cannot be
         followed to it."""
         half = self.q * float(np.sqrt(self.P[self.place, self.place]))
+        decade = self._decade
+        # A logarithm of which nothing is known may have any standard error.
+        half = min(half, 8 * decade)
         near = 0.0
         far = half / 8
         for _ in range(_STRETCHES):
+            if far > _DECADES * decade:
+                break
             risen = self.rise(far)
             if risen >= self.q:
                 far = self._crossing(near, far, _PRECISION * half)
@@ -244,6 +251,18 @@ class _Side:
             if far > _FARTHEST * half:
                 break
         return np.inf
+
+    @property
+    def _decade(self) -> float:
+        """A factor of 10 in the distance to the bound; infinite of a parameter without bounds."""
+        model = self.problem.measurement
+        lower, upper = (limits[self.place] for limits in natural_limits(model))
+        if np.isfinite(lower) == np.isfinite(upper):
+            return np.inf
+        bound = lower if np.isfinite(lower) else upper
+        value = model.physical(self.x[None])[0, self.place]
+        slope = model.physical_slope(self.x[None])[0, self.place]
+        return float(np.log(10.0) * np.abs((value - bound) / slope))
 
     def _crossing(self, near: float, far: float, precision: float) -> float:
         """Finds the distance between `near` and `far` at which the rise is q."""

@@ -8,6 +8,7 @@ import pytest
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.measurements import Formula
+from ipe_bench.report.page.answer import with_error
 
 LM = {"lm": LevenbergMarquardt()}
 X = tuple(float(k) for k in range(20))
@@ -53,3 +54,17 @@ def test_as_many_readings_as_parameters_are_no_exact_data():
     model = Formula("a*x+b", {"a": 1.0, "b": 1.0}, {"x": (0.0, 1.0)})
     (one,) = ib.estimate(model, np.array([1.0, 3.0]), LM)
     assert not one.exact
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "said"),
+    [
+        (5400011.0362, 0.0634, "5400011.036 ± 0.063"),
+        (3.0, 3.8e23, "3 ± 3.8e+23"),
+        (2.877e6, 26000.0, "(2.877 ± 0.026)e6"),
+        (0.3, 2.0, "0.3 ± 2.0"),
+        (1.2e-5, 3e-7, "(1.200 ± 0.030)e-5"),
+    ],
+)
+def test_an_estimate_is_never_hidden_by_its_error(value, error, said):
+    assert with_error(value, error) == said

@@ -3,7 +3,9 @@ minima by name."""
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.stats import norm
+from scipy.stats import t as t_law
 from shared.oracles import assert_agrees
 
 import ipe_bench as ib
@@ -260,3 +262,24 @@ def test_an_answer_is_a_frame_too():
     assert (table["low95"] < table["estimate"]).all()
     assert (table["estimate"] < table["high95"]).all()
     assert table["passes"].all()
+
+
+@pytest.mark.slow
+def test_a_profile_follows_a_positive_parameter_over_decades():
+    """Of Michaelis and Menten's curve, read where it is nearly straight: the limits by a scan of
+    the sum of squares, in which V is linear."""
+    x = np.linspace(0.1, 2, 20)
+    z = 20 * x / (20 + x) + 0.08 * np.random.default_rng(0).standard_normal(20)
+    model = Formula("V*x/(K+x)", {"V": 1.0, "K": 1.0}, {"x": tuple(x.tolist())})
+    known = {name: {"positive": True} for name in ("V", "K")}
+    found = ib.estimate(model, z, LM, parameters=known).examination
+
+    def squares(K):
+        f = x / (K + x)
+        return np.sum((z - f * (f @ z) / (f @ f)) ** 2)
+
+    limit = squares(found.x[1]) * (1 + t_law.ppf(0.975, 18) ** 2 / 18)
+    low, high = found.profiles
+    assert low[1] == pytest.approx(brentq(lambda K: squares(K) - limit, 1, found.x[1]), rel=1e-4)
+    assert squares(1e8) < limit
+    assert high.tolist() == [np.inf, np.inf]

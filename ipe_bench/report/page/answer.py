@@ -50,6 +50,10 @@ _FITS = {True: "yes", False: "NO", None: "not tested"}
 _INFLUENTIAL = 1.0
 """Standard errors by which a parameter moves without a reading from which on that reading is
 named."""
+_HIDDEN = 1e-3
+"""Share of its error below which a value is written with figures of its own."""
+_MOST_FIGURES = 12
+"""Figures beyond which two numbers are not written to one place."""
 _MOST_READINGS = 5
 _MOST_MINIMA = 3
 
@@ -285,21 +289,26 @@ def with_error(value: float, error: float) -> str:
     place, one exponent."""
     if not (math.isfinite(value) and math.isfinite(error) and error > 0):
         return _number(value, 6)
-    if error < 1e-14 * abs(value):
+    if error < 1e-12 * abs(value):
         return f"{_number(value, 15)} ± {error:.2g}"
     # 0.0999 rounds to 0.10.
     rounded = float(f"{error:.1e}")
     place = math.floor(math.log10(rounded)) - 1
+    if 0 < abs(value) < _HIDDEN * error:
+        # An error that is so much larger must not hide the value.
+        return f"{value:.3g} ± {error:.2g}"
     return _together((value, error), " ± ", place)
 
 
 def _together(values: Sequence[float], between: str, place: int) -> str:
-    """Writes numbers to one decimal place, with one exponent for all if they are very large or very
-    small."""
+    """Writes numbers to one decimal place, with one exponent for all if they are very small, or so
+    large that figures before the point are not known."""
     largest = max(map(abs, values))
-    if 1e-4 <= largest < 1e6 and place >= -6:
-        return between.join(f"{round(v, -place):.{max(-place, 0)}f}" for v in values)
     power = math.floor(math.log10(largest or 10.0**place))
+    if power - place > _MOST_FIGURES:
+        return between.join(f"{v:.4g}" for v in values)
+    if largest >= 1e-4 and place >= -6 and (largest < 1e6 or place <= 0):
+        return between.join(f"{round(v, -place):.{max(-place, 0)}f}" for v in values)
     figures = min(max(power - place, 0), 15)
     digits = [f"{Decimal(v).scaleb(-power):.{figures}f}" for v in values]
     return f"({between.join(digits)})e{power}"
