@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cached_property
 from itertools import combinations, compress, pairwise
 from pathlib import Path
@@ -139,7 +140,11 @@ def _read(table: TextTable, model: StateModel) -> Log:
     _require_rows(table)
     cells = {}
     for name, heading in columns.items():
-        cells[name] = np.array([table.value(*cell) for cell in table.column(heading)])
+        texts = table.column(heading)
+        seconds = _seconds([text for text, _ in texts]) if name == "time" else None
+        if seconds is None:
+            seconds = np.array([table.value(*cell) for cell in texts])
+        cells[name] = seconds
 
     def refuse(bad: Array, name: str, what: str) -> None:
         if bad.any():
@@ -154,9 +159,9 @@ def _read(table: TextTable, model: StateModel) -> Log:
         refuse(fault.where, fault.column, fault.reason)
     if "time" in model.log_inputs:
         refuse(
-            np.diff(cells["time"], prepend=-np.inf) <= 0,
+            np.diff(cells["time"], prepend=-np.inf) < 0,
             "time",
-            "is not after the time of the row before; give rows in the order of their times",
+            "is before the time of the row above; give rows in the order of their times",
         )
     model = model.with_log(len(z), {name: cells[name] for name in model.log_inputs})
     if len(z) != model.epochs:
@@ -170,15 +175,31 @@ def _read(table: TextTable, model: StateModel) -> Log:
     numbers = np.arange(1.0, len(z) + 1)
     for name, right, off in (("epoch", numbers, 0.0), ("time", model.times, near)):
         wrong = ~(np.abs(cells.get(name, right) - right) <= off)
+        remedy = f"set ignore_columns=[{name}]"
+        if name == "time" and isinstance(model, Formulas):
+            remedy = (
+                "take the times of the file by state_model.inputs.time=0, and dt for the steps"
+                " between them in formulas"
+            )
         refuse(
             wrong,
             name,
             f"{right[np.argmax(wrong)]:g} belongs here; give a row for each epoch, in order, or"
-            f" set ignore_columns=[{name}]",
+            f" {remedy}",
         )
     if not np.isfinite(z).any():
         raise table.error("has no reading")
     return Log(model, z, (str(table.path), table.digest))
+
+
+def _seconds(texts: Sequence[str]) -> Array | None:
+    """Reads ISO 8601 times as seconds since the first; None if they are none."""
+    try:
+        times = [datetime.fromisoformat(text.strip()) for text in texts]
+        since = [(time - times[0]).total_seconds() for time in times]
+    except (ValueError, TypeError):
+        return None
+    return np.array(since)
 
 
 def _headings(table: TextTable, wanted: Sequence[str]) -> dict[str, str]:
@@ -252,8 +273,8 @@ class LogTracks:
     covariance: Array
     """Their covariance (K, n, n)."""
     predicted: Array
-    """The readings (K, m) that were predicted from those before; NaN where a reading is missing,
-    and if the tracker has no innovations."""
+    """The readings (K, m) that were predicted from those before, NaN if the tracker has no
+    innovations; where a reading is missing, the one that is expected at the state of its epoch."""
     predicted_deviation: Array
     """Their standard deviations (K, m)."""
     nis: Array
@@ -301,6 +322,11 @@ class LogTracks:
         deviation = deviations(tracks.covariance[0]) * sizes
         innovations = tracks.innovations.swapaxes(1, 2)
         predicted, predicted_deviation = tracks.predicted_readings(log.z[None])
+        missing = np.isnan(log.z)
+        if missing.any():
+            h, spread = _readings_at(log.model, tracks)
+            predicted = np.where(missing, h, predicted)
+            predicted_deviation = np.where(missing, spread, predicted_deviation)
         nis = np.where(tracks.degrees[0] > 0, tracks.nis[0], np.nan)
 
         # The squared misfit of the whole log, which is chi-square with a degree per reading.
@@ -362,6 +388,22 @@ class LogTracks:
         if self.mean_nis > high:
             return OVERCONFIDENT
         return TOO_CAUTIOUS if self.mean_nis < low else CONSISTENT
+
+
+def _readings_at(model: StateModel, tracks: Tracks) -> tuple[Array, Array]:
+    """Computes the readings (1, K, m) that are expected at the states of a track, and their
+    standard deviations, with those of the readings themselves."""
+    expected = []
+    variances = []
+    for k in range(model.epochs):
+        x = tracks.mean[:, k]
+        with np.errstate(all="ignore"):
+            h, H = model.observation_at(k).slope(x)
+        R = model.R_at(x, k) if model.R_by_state else model.R(k)
+        P = tracks.covariance[:, k]
+        expected.append(h)
+        variances.append(np.diagonal(H @ P @ H.swapaxes(1, 2) + R, axis1=1, axis2=2))
+    return np.stack(expected, axis=1), np.sqrt(np.stack(variances, axis=1))
 
 
 def _second(log: Log, tracks: Tracks) -> list[str]:

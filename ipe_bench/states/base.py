@@ -505,8 +505,8 @@ def _name_faults(model: StateModel) -> Iterator[str]:
 
 
 def _time_faults(model: StateModel) -> Iterator[str]:
-    if not model.epochs or not (np.diff(model.times) > 0).all():
-        yield "its times do not increase from epoch to epoch; give epochs in order"
+    if not model.epochs or not (np.diff(model.times) >= 0).all():
+        yield "its times decrease from one epoch to the next; give epochs in order"
 
 
 def _noise_faults(model: StateModel) -> Iterator[str]:

@@ -32,8 +32,8 @@ from ipe_bench.states.base import Normal, Paths, StateModel
 @dataclass(frozen=True, kw_only=True)
 class Formulas(StateModel):
     """States whose next values, and readings, are formulas of the states, constants, the number k
-    of the epoch from 1 on, and its time t in s; the transition may contain the names of the process
-    noise, each with a factor.
+    of the epoch from 1 on, its time t in s, and the step dt since the epoch before; the transition
+    may contain the names of the process noise, each with a factor.
 
     The language is that of `ipe_bench.measurements.arithmetic`: + - * / ** and elementary
     functions, angles in rad.
@@ -148,6 +148,20 @@ class Formulas(StateModel):
         steps = np.arange(self.count) + self.moved_first
         return self.step * steps
 
+    @cached_property
+    def _clock(self) -> dict[str, Array]:
+        """What formulas may name of each epoch (K,): its number, its time, and the step since the
+        epoch before, unless the model has a dt of its own."""
+        clock = {"k": np.arange(1.0, self.count + 1), "t": self._times}
+        if "dt" not in {*self.next, *self.noise, *self.constants, *self.inputs}:
+            # Where times are given, the prior is that of the first one.
+            before = self._times[0] if "time" in self._inputs else 0.0
+            clock["dt"] = np.diff(self._times, prepend=before)
+        return clock
+
+    def _at_epoch(self, k: int) -> dict[str, float]:
+        return {name: float(values[k]) for name, values in self._clock.items()}
+
     @property
     def log_inputs(self) -> tuple[str, ...]:
         return tuple(self.inputs)
@@ -198,8 +212,7 @@ class Formulas(StateModel):
         formulas = self._transitions if name == "transition" else self._readings
         by_epoch = {
             **self._inputs,
-            "k": np.arange(1.0, self.count + 1),
-            "t": self._times,
+            **self._clock,
             **{name: np.full(self.count, value) for name, value in self.constants.items()},
         }
         graph = Graph()
@@ -222,7 +235,7 @@ class Formulas(StateModel):
     @cached_property
     def _factors(self) -> _Factors:
         graph = Graph()
-        names = (*self.next, *self.inputs, "k", "t", *self.noise)
+        names = (*self.next, *self.inputs, *self._clock, *self.noise)
         known = {name: graph.input(name) for name in names}
         values = {**self.constants, **known}
         w = [known[name] for name in self.noise]
@@ -263,7 +276,7 @@ class Formulas(StateModel):
         states = np.moveaxis(x, -1, 0)
         inputs = [float(values[k]) for values in self._inputs.values()]
         with np.errstate(all="ignore"):
-            factors = self._program([*states, *inputs, k + 1.0, float(self._times[k])])
+            factors = self._program([*states, *inputs, *self._at_epoch(k).values()])
         # A factor that is the same in all states is one number, and becomes one for each.
         each = np.broadcast_arrays(x[..., 0], *factors)[1:]
         return np.stack(each, axis=-1).reshape(*x.shape, len(self.noise))
@@ -271,7 +284,7 @@ class Formulas(StateModel):
     def gain(self, k: int) -> Array:
         if self.gain_by_state:
             return super().gain(k)
-        by_epoch = {"k", "t", *self.inputs}
+        by_epoch = {*self._clock, *self.inputs}
         return self._gain(k) if self._named_by_next & by_epoch else self._steady_gain
 
     @cached_property
@@ -313,8 +326,7 @@ class Formulas(StateModel):
         """Evaluates formulas (..., number) at states x (..., n) at epoch k."""
         states = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True))
         inputs = {name: float(values[k]) for name, values in self._inputs.items()}
-        epoch = {"k": k + 1.0, "t": float(self._times[k])}
-        known = {**states, **noise, **inputs, **self.constants, **epoch}
+        known = {**states, **noise, **inputs, **self.constants, **self._at_epoch(k)}
         with np.errstate(all="ignore"):
             values = [formula(known) for formula in formulas.values()]
         # A formula without states is one number, and becomes one for each.
@@ -351,7 +363,7 @@ def _check_formulas(model: Formulas) -> None:
     transitions = model._transitions
     readings = model._readings
     deviations = model._deviations
-    known = {*model.next, *model.constants, *model.inputs, "k", "t"}
+    known = {*model.next, *model.constants, *model.inputs, "k", "t", "dt"}
     _check_group("next", transitions, {*known, *model.noise})
     _check_group("readings", readings, known)
     if deviations:

@@ -235,12 +235,55 @@ def test_the_times_of_a_log_are_those_of_its_epochs(tmp_path):
     assert answer["ekf"].mean[2, 0] == pytest.approx(4.75 + (4.0 - 4.75) / 1.04, rel=1e-12)
     pd.DataFrame({"time [s]": t[[0, 2, 1]], "z": z}).to_csv(tmp_path / "back.csv", index=False)
     with pytest.raises(
-        ib.UserError, match=r"row 4, column time \[s\]: is not after the time of the row before"
+        ib.UserError, match=r"row 4, column time \[s\]: is before the time of the row above"
     ):
         ib.estimate(model, tmp_path / "back.csv", {"ekf": ekf()})
     pd.DataFrame({"time [ms]": t, "z": z}).to_csv(tmp_path / "ms.csv", index=False)
     with pytest.raises(ib.UserError, match=r"column time \[ms\]: the unit must be s, as in"):
         ib.estimate(model, tmp_path / "ms.csv", {"ekf": ekf()})
+
+
+@pytest.mark.oracle(
+    "closed form: Kalman filter of two states", "uneven steps and predictions", 1e-12
+)
+@pytest.mark.parametrize("stamps", [False, True])
+def test_dt_is_the_step_and_missing_readings_are_predicted(stamps, tmp_path):
+    """Two readings have one time, and two rows at the end ask for a forecast."""
+    model = Formulas(
+        next={"x": "x + dt*v", "v": "v + dt*w"},
+        readings={"z": "x"},
+        noise={"w": 0.1},
+        deviation={"z": 0.2},
+        spread={"x": 5.0, "v": 1.0},
+        inputs={"time": 0.0},
+    )
+    t = np.array([0.0, 1.0, 1.0, 2.5, 4.0])
+    z = np.array([1.0, 2.1, 2.2, np.nan, np.nan])
+    time = t.tolist()
+    if stamps:
+        time = ["2024-02-28T23:59:59", *(f"2024-02-29T00:00:{one - 1:06.3f}" for one in t[1:])]
+    log = tmp_path / "log.csv"
+    pd.DataFrame({"time": time, "z": z}).to_csv(log, index=False)
+    (one,) = ib.estimate(model, log, {"ekf": ekf()})
+    x, P = np.zeros(2), np.diag([25.0, 1.0])
+    for k, dt in enumerate(np.diff(t, prepend=0.0)):
+        F = np.array([[1.0, dt], [0.0, 1.0]])
+        x, P = F @ x, F @ P @ F.T + np.diag([0.0, (0.1 * dt) ** 2])
+        assert one.predicted[k, 0] == pytest.approx(x[0], rel=1e-12, abs=1e-12)
+        assert one.predicted_deviation[k, 0] == pytest.approx(np.sqrt(P[0, 0] + 0.04), rel=1e-12)
+        if np.isfinite(z[k]):
+            K = P[:, 0] / (P[0, 0] + 0.04)
+            x, P = x + K * (z[k] - x[0]), P - np.outer(K, P[0])
+    assert one.mean[-1] == pytest.approx(x, rel=1e-12)
+
+
+def test_a_log_whose_times_are_uneven_is_told_of_dt(tmp_path):
+    model = replace(DRIVEN, next={"x": "x + w"}, inputs={})
+    pd.DataFrame({"time": [1.0, 2.0, 4.0], "z": np.ones(3)}).to_csv(
+        tmp_path / "log.csv", index=False
+    )
+    with pytest.raises(ib.UserError, match=r"state_model\.inputs\.time=0, and dt for the steps"):
+        ib.estimate(model, tmp_path / "log.csv", {"ekf": ekf()})
 
 
 @pytest.mark.parametrize(("unit", "fits"), [("deg", False), ("°", False), ("rad", True)])

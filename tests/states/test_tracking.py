@@ -366,7 +366,7 @@ class Odd(ConstantVelocity):
 @pytest.mark.parametrize(
     ("part", "complaint"),
     [
-        ("times", "its times do not increase from epoch to epoch"),
+        ("times", "its times decrease from one epoch to the next"),
         ("size", r"Q of epoch 1 has shape \(3, 3\), where \(2, 2\) belongs"),
         ("skew", "Q of epoch 1 is not symmetric"),
         ("negative", "Q of epoch 1 has a negative eigenvalue"),
