@@ -243,9 +243,6 @@ def test_the_times_of_a_log_are_those_of_its_epochs(tmp_path):
         ib.estimate(model, tmp_path / "ms.csv", {"ekf": ekf()})
 
 
-@pytest.mark.oracle(
-    "closed form: Kalman filter of two states", "uneven steps and predictions", 1e-12
-)
 @pytest.mark.parametrize("stamps", [False, True])
 def test_dt_is_the_step_and_missing_readings_are_predicted(stamps, tmp_path):
     """Two readings have one time, and two rows at the end ask for a forecast."""
