@@ -133,7 +133,7 @@ def show_report(
             f"Here too  {counted(others, 'result')} of other commands; `ipe-bench report {output}`"
             " shows all"
         )
-    return 1 if collection.problems else 0
+    return 1 if collection.problems or begun.useless else 0
 
 
 def _print_table(rows: Sequence[Mapping[str, Any]], collection: Any) -> None:

@@ -176,17 +176,35 @@ class Begun:
     @property
     def raised(self) -> list[str]:
         """A line for each estimator whose trials raised exceptions, with the commonest of them."""
-        raised = defaultdict[str, list[dict[str, Any]]](list)
-        for row in self._rows["endings"]:
-            if row["status"] == Status.ERROR.label:
-                raised[row["estimator"]].append(row)
         lines = []
-        for label, rows in raised.items():
+        for label, rows in self._errors().items():
             trials = sum(row["trials"] for row in rows)
             commonest = max(rows, key=lambda row: row["trials"])
             times = "1 trial" if trials == 1 else f"{trials} trials"
             lines.append(f"{label}: {times} ended by an exception: {commonest['message']}")
         return lines
+
+    @property
+    def useless(self) -> list[str]:
+        """The estimators all of whose trials raised exceptions."""
+        asked = Counter[str]()
+        for row in self.summary:
+            if row["parameter"] == ALL:
+                asked[row["estimator"]] += row["trials"]
+        errors = self._errors()
+        return [
+            label
+            for label, rows in errors.items()
+            if sum(row["trials"] for row in rows) == asked[label]
+        ]
+
+    def _errors(self) -> dict[str, list[dict[str, Any]]]:
+        """Returns the endings by exceptions, by estimator."""
+        found = defaultdict[str, list[dict[str, Any]]](list)
+        for row in self._rows["endings"]:
+            if row["status"] == Status.ERROR.label:
+                found[row["estimator"]].append(row)
+        return found
 
     def finish(self) -> Analysis:
         """Completes the analysis."""

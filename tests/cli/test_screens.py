@@ -122,7 +122,7 @@ class Unfinished(ib.baselines.EKF):
 def test_a_report_tells_which_exception_ended_the_trials(capsys, tmp_path):
     bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
     ib.run(bench, {"mine": Unfinished()}, trials=4, output=str(tmp_path))
-    main(["report", str(tmp_path), "figures=none"])
+    assert main(["report", str(tmp_path), "figures=none"]) == 1  # all of them
     lines = capsys.readouterr().out.splitlines()
     assert "mine: 4 trials ended by an exception: AttributeError: no such thing" in lines
 
