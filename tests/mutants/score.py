@@ -53,6 +53,10 @@ ROOMS = {
             "tests/trials/test_fit_test.py",
         ),
     ),
+    "functions": (
+        ("functions/*.py", "states/along.py", "states/redone.py", "states/lost.py"),
+        ("tests/functions", "tests/states/test_along.py", "tests/states/test_lost.py"),
+    ),
     "filters": (
         tuple(f"baselines/{name}.py" for name in ("kalman", "epochs", "sequential", "information")),
         ("tests/baselines/test_filters.py",),
