@@ -110,6 +110,8 @@ class Graph:
                 return self.constant(0.0)
             case ("sub", [0.0, _]) | ("mul", [-1.0, _]):
                 return self.apply("neg", args[1])
+            case ("pow", [_, 0.0]):
+                return self.constant(1.0)
             case ("pow", [_, 2.0]):
                 return self.apply("mul", args[0], args[0])
             case ("pow", [_, 0.5]):
@@ -171,6 +173,13 @@ class Expression:
             f" {remedy}"
         )
 
+    def __eq__(self, other: object) -> Any:
+        # Expressions are kept in sets and are keys: among them only the same one is equal.
+        if isinstance(other, int | float | np.number):
+            return COMPOSED["equal"](self.graph.apply, self, other)
+        return self is other
+
+    __hash__ = object.__hash__
     __lt__, __gt__ = _operator("less"), _operator("less", reflected=True)
     __le__, __ge__ = _operator("less_equal"), _operator("less_equal", reflected=True)
 

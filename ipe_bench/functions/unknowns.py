@@ -379,6 +379,15 @@ def unknowns(found: Any, graph: ExactGraph) -> Any:
     return view
 
 
+def _kept(found: Any, graph: ExactGraph) -> Any:
+    """Returns arrays of objects as unknowns, which NumPy's concatenation and the like forget."""
+    if isinstance(found, list | tuple):
+        return type(found)(_kept(one, graph) for one in found)
+    if type(found) is np.ndarray and found.dtype.kind == "O":
+        return unknowns(found, graph)
+    return found
+
+
 def _by_entry(function: Callable[..., Any], *arrays: Any) -> Any:
     return objects(np.frompyfunc(function, len(arrays), 1)(*map(objects, arrays)))
 
@@ -521,8 +530,8 @@ def _function(graph: Any, function: Any, args: Any, kwargs: Any, plain: Any = No
     """Records a function of NumPy that is no ufunc; `plain` is NumPy's own for arrays."""
     if function in _MOVED:
         if plain is None:
-            return function._implementation(*args, **kwargs)
-        return plain(function, (Unknowns,), args, kwargs)
+            return _kept(function._implementation(*args, **kwargs), graph)
+        return _kept(plain(function, (Unknowns,), args, kwargs), graph)
     if function not in _WRITTEN_OUT:
         raise graph.refuse(f"np.{function.__name__} is not recorded")
     try:

@@ -40,7 +40,7 @@ from ipe_bench.statistics.verdicts import (
     TOO_CAUTIOUS,
     WRONG,
 )
-from ipe_bench.trials.paths import StateScenario, track_safely
+from ipe_bench.trials.paths import REDONE, StateScenario, track_safely
 from ipe_bench.trials.thresholds import FIT_LEVEL, GATE
 from ipe_bench.trials.whiteness import white_p
 
@@ -342,6 +342,8 @@ class LogTracks:
         lost_from = _lost_from(nis, tracks.degrees[0])
         ended = Status.CONVERGED if tracks.status is None else Status(int(tracks.status[0]))
         message = "" if ended == Status.CONVERGED else f"{ended.label}: {ended.reason}"
+        if tracks.by_epoch is not None and tracks.by_epoch[0]:
+            message = REDONE
         message = why_lost(log.model, tracks.mean).get(0, message)
         # What is not known, NaN, is no reason against a track.
         whole = bool(np.isfinite([mean, deviation]).all())

@@ -15,7 +15,7 @@ from shared.slopes import differentiate
 
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
-from ipe_bench.measurements import Measurement, Parameter, function
+from ipe_bench.measurements import Measurement, OdeMeasurement, Parameter, function
 
 CORNER = np.array([500000.0, 5400000.0])
 STATIONS = np.array([(0, 0), (40, 0), (40, 30), (0, 30), (20, 45)]) + CORNER
@@ -156,3 +156,44 @@ class Folded(Ranges):
 def test_an_own_class_that_is_not_analytic_is_refused_where_it_says_so():
     with pytest.raises(UserError, match="leave `analytic` out"):
         Folded().jacobian(np.array([[2.0, 3.0]]))
+
+
+@dataclass(frozen=True)
+class Braking(OdeMeasurement):
+    """Differential equations in Python that compare what np.asarray returned."""
+
+    states = 1
+    outputs = ("speed",)
+    parameters: Any = (Parameter("k"),)
+    tolerance = 1e-6
+    power: float = 0.0
+
+    @property
+    def nominal(self):
+        return np.ones(1)
+
+    @property
+    def times(self):
+        return np.array([1.0, 2.0])
+
+    def start(self, p, c):
+        return (2.0,)
+
+    def rhs(self, t, y, p, c):
+        if self.power:
+            return (-p[0] * np.where(np.asarray(y[0]) == 0, 0.0, 1.0) * y[0],)
+        return (-p[0] * y[0] * (y[0] - y[0]) ** 0,)
+
+    def read(self, t, y, p, c):
+        return (y[0],)
+
+
+def test_equations_in_python_do_not_compare_unknowns_as_if_they_were_known():
+    with pytest.raises((TypeError, UserError), match="truth value"):
+        Braking(power=1.0).simulate(np.array([[1.0]]))
+    model = Braking()
+    np.testing.assert_allclose(
+        model.simulate(np.array([[0.5]]))[0], 2 * np.exp([-0.5, -1.0]), rtol=1e-5
+    )
+    slopes = -2 * np.array([1.0, 2.0]) * np.exp([-0.5, -1.0])
+    np.testing.assert_allclose(model.jacobian(np.array([[0.5]]))[0, :, 0], slopes, rtol=1e-4)

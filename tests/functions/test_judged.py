@@ -10,7 +10,7 @@ import pytest
 
 from ipe_bench.functions.differences import RIGHT, WRONG, by_differences, judge, measured
 from ipe_bench.functions.judged import Judged
-from ipe_bench.functions.recording import NotRecorded, written
+from ipe_bench.functions.recording import NotRecorded, compiled_rows, written
 from ipe_bench.measurements import Parameter
 from ipe_bench.states import Normal, StateModel, ekf, ukf
 
@@ -106,6 +106,30 @@ def _swallowed(x):
 def test_what_would_be_recorded_as_another_function_is_refused(function, why):
     with pytest.raises(NotRecorded, match=why):
         written(function, 2)
+
+
+TRUTHS = {
+    "a choice of truths": lambda a, b: np.where(a > 0, b > 0, a > 1) + (b > 1),
+    "a choice of a truth and a number": lambda a, b: np.where(a > 0, b > 0, b) + (b > 1),
+    "or": lambda a, b: 1 - ((a > 0) | (b > 0)) * 1.0,
+    "exclusive or": lambda a, b: ((a > 0) ^ (b > 0)) * a,
+    "a number for a truth": lambda a, b: np.logical_and(a, b > 0) + np.logical_or(a, b) * 2.0,
+    "fmin": lambda a, b: np.fmin(a, b) + np.fmax(a, np.log(b)),
+    "a limit": lambda a, b: np.clip(a, b, 1.0) + np.isinf(1 / a) * 3.0,
+    "a mean": lambda a, b: np.mean([a, b, a * b], axis=0),
+    "how many": lambda a, b: np.sum(np.stack([a > 0, b > 0, a > b]), axis=0) * b,
+}
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_a_recording_has_the_values_of_numpy(name):
+    numbers = [-2.0, -1.0, -0.0, 0.0, 0.5, 1.0, 3.0, np.nan]
+    x = np.array([[a, b] for a in numbers for b in numbers])
+    one = written(lambda x: np.stack([TRUTHS[name](x[..., 0], x[..., 1])], axis=-1), 2)
+    with np.errstate(all="ignore"):
+        found = compiled_rows(one)[0](x, np.array([one.numbers]))[:, 0]
+        wanted = TRUTHS[name](x[:, 0], x[:, 1])
+    np.testing.assert_allclose(found, wanted, rtol=1e-15)
 
 
 K = 60
