@@ -14,6 +14,9 @@ from ipe_bench.report.sections import report_tables
 from ipe_bench.report.tables.table import COLUMN, PAGE, Column, Table, latex
 from ipe_bench.statistics.analysis import Analysis
 
+_KEYS = ("parameter", "second", "status", "start", "state", "message")
+"""Titles of further columns that tell rows apart, besides those up to the name of a row."""
+
 
 def export(
     analysis: Analysis,
@@ -33,7 +36,7 @@ def export(
             f"width={width:g}: give inches, such as {COLUMN:g} for one column and {PAGE:g} for two"
         )
     tables = {table.name: table for table in report_tables(analysis)}
-    chosen = [_with_columns(tables[name], columns) for name in names if name in tables]
+    chosen = [with_columns(tables[name], columns) for name in names if name in tables]
     if columns and not chosen:
         raise UserError(
             f"columns={','.join(columns)}: goes with a table; paper={','.join(names)} names none"
@@ -46,9 +49,9 @@ def export(
     return files
 
 
-def _with_columns(table: Table, names: Sequence[str]) -> Table:
-    """Returns the table with these columns, in this order, or all; a column's name is its title in
-    letters, digits and underscores."""
+def with_columns(table: Table, names: Sequence[str]) -> Table:
+    """Returns the table with these columns, in this order, or all, behind those that tell its rows
+    apart; a column's name is its title in letters, digits and underscores."""
     known: dict[str, Column] = {}
     for column in table.columns:
         words = re.sub(r"[^a-z0-9]+", "_", column.title.lower())
@@ -57,7 +60,17 @@ def _with_columns(table: Table, names: Sequence[str]) -> Table:
         known[f"{name}_{len(alike) + 1}" if alike else name] = column
     for name in names:
         refuse_unknown(f"columns={name}", name, known, f"column of {table.name}")
-    return replace(table, columns=[known[name] for name in names or known])
+    chosen = [known[name] for name in names or known]
+    apart = list(table.columns[: table.naming + 1])
+    apart += [one for one in table.columns[len(apart) :] if one.title in _KEYS]
+    keys = [one for one in apart if not _is_told(one, chosen)]
+    return replace(table, columns=[*keys, *chosen])
+
+
+def _is_told(key: Column, chosen: Sequence[Column]) -> bool:
+    """Returns whether a column is chosen already, or says the same in every row."""
+    texts = {cell.text for cell in key.cells}
+    return len(texts) == 1 or any(key is one for one in chosen)
 
 
 def _figures(

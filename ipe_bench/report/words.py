@@ -23,7 +23,11 @@ def value_text(value: Any) -> str:
     """Formats a number without needless zeros; a dash stands for a missing one."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "-"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    text = f"{value:g}"
+    # Six figures, unless more tell it from another number; round-off does not.
+    return text if math.isclose(float(text), value, rel_tol=1e-12) else repr(float(value))
 
 
 def assignments(settings: Mapping[Any, str]) -> str:

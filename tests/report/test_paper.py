@@ -12,7 +12,7 @@ from shared.reports import HOSTILE, fill
 from ipe_bench.basics.errors import UserError
 from ipe_bench.report import figures
 from ipe_bench.report.paper import export
-from ipe_bench.report.tables.table import COLUMN, PAGE, Table, interval, latex, words
+from ipe_bench.report.tables.table import COLUMN, PAGE, Table, column, interval, latex, words
 from ipe_bench.report.words import percent, short
 from ipe_bench.statistics import analyse
 
@@ -47,6 +47,7 @@ COMMANDS = {
         "textbackslash",
         "textless",
         "textgreater",
+        "infty",
         "textbar",
         "textquotedbl",
     ),
@@ -176,3 +177,15 @@ def test_mistakes_name_what_there_is(synthetic, tmp_path):
     ):
         with pytest.raises(UserError, match=said):
             export(analysis, tmp_path, names, columns, width)
+
+
+def test_chosen_columns_stand_behind_those_that_tell_rows_apart(synthetic, tmp_path):
+    """Of two estimators at two error scales, and an infinite error among numbers."""
+    fill(synthetic, labels=("one", "two"), scales=(1.0, 10.0))
+    analysis = analyse([synthetic.directory])
+    (file,) = export(analysis, tmp_path, ["overview"], ["estimator", "success"])
+    header, *rows = read(file.read_text(encoding="utf-8"))
+    assert header == ["error scale", "estimator", "success"]
+    assert len({tuple(row[:2]) for row in rows}) == len(rows) == 4
+    table = Table("t", "T", "", [words("estimator", ["a"]), column("error", [float("inf")], short)])
+    assert r"\ensuremath{\infty}" in latex(table)

@@ -4,6 +4,7 @@ question is of."""
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from shared.synthetic_store import Pretender
 
 from ipe_bench.questions.compare.effects import Effect
 from ipe_bench.questions.compare.maths import _loss, compared
@@ -75,3 +76,22 @@ def test_bias_is_of_the_trials_in_which_both_succeed(synthetic):
     for row, name in zip([r for r in rows if r["quantity"].startswith("bias")], "abc", strict=True):
         assert row["first_value"] == pytest.approx(kept[:, "abc".index(name)].mean(), abs=1e-9)
         assert row["change"] == pytest.approx(0.2)
+
+
+def test_success_is_as_the_table_of_a_run_counts_it_or_by_one_gate_for_both(synthetic):
+    """Of two filters with a prior, whose own gate is wider, and of one beside an estimator
+    without."""
+    scenario = synthetic.scenario()
+    errors = 3 * BOUND * DEVIATES[:200]
+    wide = np.ones(200, dtype=bool)
+    for number, label in enumerate(("filter", "other")):
+        estimator = Pretender(option=number, knows_prior=True)
+        synthetic.add(scenario, label, errors, estimator=estimator, success=wide)
+    synthetic.add(scenario, "plain", errors)
+    collection = collect([synthetic.directory])
+    inside = np.mean((9 * DEVIATES[:200] ** 2).sum(axis=1) <= chi2.isf(GATE, 3))
+    assert inside < 0.9
+    for pair, share in ((("filter", "other"), 1.0), (("filter", "plain"), inside)):
+        (row, *_) = compared(collection, collection, pair)
+        assert row["quantity"] == "success"
+        assert row["first_value"] == pytest.approx(share)

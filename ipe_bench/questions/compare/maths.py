@@ -201,7 +201,7 @@ def _columns(
 ) -> Iterator[_Column]:
     """Yields the numbers of both in the matched trials."""
     radius = float(np.sqrt(gate(a.n)))
-    yield _Column("success", a.inside_gate[one], b.inside_gate[other])
+    yield _Column("success", *_successes(a, b, one, other))
     # An error beyond the gate counts as one on it, so that few failures do not decide the mean.
     first = np.minimum(a.distance[one], radius)
     second = np.minimum(b.distance[other], radius)
@@ -211,6 +211,14 @@ def _columns(
     if "bias" in tested:
         yield from _biases(a, b, one, other, 2 * radius)
     yield _Column("cost", a.cost[one], b.cost[other])
+
+
+def _successes(a: Sample, b: Sample, one: Array, other: Array) -> tuple[Array, Array]:
+    """Returns the successes of both as the table of a run counts them; by the Cramér-Rao bound, one
+    gate for both, if one alone is held against the Bayesian bound."""
+    if a.group.footer["bound"] == b.group.footer["bound"]:
+        return a.scalars["success"][one], b.scalars["success"][other]
+    return a.inside_gate[one], b.inside_gate[other]
 
 
 def _honesty(a: Sample, b: Sample, one: Array, other: Array, most: float) -> _Column:

@@ -91,9 +91,11 @@ def _mark(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:
 
 
 def _cheapest(rows: pd.DataFrame, scale: float) -> str:
-    """Names the estimator that reaches about the least error at a scale for the fewest
-    simulations."""
+    """Names the estimator that reaches about the least error at a scale for the fewest simulations;
+    nobody where all are lost."""
     here = rows[rows["error_scale"] == scale]
+    if here["error"].min() >= _HIGHEST:
+        return ""
     good = here[here["error"] <= here["error"].min() * 1.05]
     best = good.sort_values("simulations_median", kind="stable").iloc[0]
     who = f"{best['estimator']}, {short(best['simulations_median'])} simulations"

@@ -232,7 +232,7 @@ def _word(value: Any) -> str:
     if value is None or (pd.api.types.is_scalar(value) and pd.isna(value)):
         return "-"
     text = value_text(value)
-    # Six figures where they say it all: values that differ later are different settings.
+
     if isinstance(value, float) and float(text) != value:
         return str(value)
     return text

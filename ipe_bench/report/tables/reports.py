@@ -128,7 +128,7 @@ def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
         told = [words("setting", wording.settings(listed, analysis.setting_columns))]
     else:
         told = [words(name, map(value_text, rows[name])) for name in apart]
-    return [*told, column("error scale", rows["error_scale"], "{:g}".format)]
+    return [*told, column("error scale", rows["error_scale"], value_text)]
 
 
 def _texts(rows: pd.DataFrame, *names: str) -> list[Column]:

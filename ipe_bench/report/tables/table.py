@@ -533,6 +533,7 @@ def _latex_cell(cell: Cell, column: Column) -> str:
     """Returns a cell; siunitx sets numbers, whose digits it groups by its own rules."""
     text = escaped(cell.text)
     if column.numeric:
+        text = re.sub(r"\binf\b", r"\\ensuremath{\\infty}", text)
         text = _NUMBER.sub(_latex_number, text).replace(r"} \%", r"}\,\%")
         text = text.replace(r"}-\num", r"}--\num")
     return rf"\textbf{{{text}}}" if cell.best else text
