@@ -22,6 +22,9 @@ _TRIALS = 200
 """Data sets that are simulated unless trials= says otherwise."""
 _LOGS = 100
 """Logs likewise."""
+_MOST_READINGS = 4_000_000
+"""Readings of all of them, which are held at once for each estimator: there are fewer of long data
+sets."""
 _FEWEST = 20
 """Fewest of either that say anything of shares."""
 _WITHOUT_MEANING = (*of("run", "figures"), TRUTH, "find", "experiment")
@@ -67,10 +70,11 @@ def _of_constants(asked: Single, files: list[str]) -> tuple[Own, AbstractContext
     from ipe_bench.questions.own.maths import own
 
     spec = asked.spec
-    trials = spec.trials or _TRIALS
     answers = standard.constructed({"solver": ("auto",)})
     fitting = replace(spec, readings=tuple(files), estimators=answers)
     question = fitting.question(asked.words.keys).checked()
+    affordable = max(_FEWEST, _MOST_READINGS // question.found.model.m)
+    trials = spec.trials or min(_TRIALS, affordable)
     folder = _folder(
         asked,
         trials,

@@ -8,12 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.spec import Spec
-from ipe_bench.measurements.known import ParameterInfo, informed
+from ipe_bench.measurements.base import SubsetModel
+from ipe_bench.measurements.known import ConstrainedModel
 from ipe_bench.noise import Gaussian
 from ipe_bench.noise.base import Noise
 from ipe_bench.plugins import standard
+from ipe_bench.questions.own.maths import require_answer
 from ipe_bench.real.fits import Fit
 
 NEAR = 0.1
@@ -24,21 +25,13 @@ def fitted(spec: Spec, files: Sequence[str], stated: Collection[str]) -> Fit:
     """Fits the model of a job to the readings in files; `stated` are the keys that were typed.
 
     Raises:
-        UserError: no estimate is found, or the model does not fit.
+        UserError: nothing can be simulated like these readings.
     """
     estimators = standard.constructed({"solver": ("auto",)})
     asked = replace(spec, readings=tuple(files), estimators=estimators)
     fits, _ = asked.question(stated).checked().fitted()
-    fit = fits[0]
-    if not fit.passes:
-        why = "the model does not fit them"
-        if not np.isfinite(fit.x).all() or fit.fits is not False:
-            why = f"the estimate ended {fit.status.label}"
-        raise UserError(
-            f"{', '.join(files)}: {why}, so nothing can be simulated like these readings; see"
-            " `ipe-bench estimate` with the same words"
-        )
-    return fit
+    require_answer(fits[0])
+    return fits[0]
 
 
 def noise_of(fit: Fit) -> Gaussian:
@@ -55,30 +48,38 @@ def like_these(
     """Returns the job with the columns and noise of these readings, and lines that say what was
     taken; with its truths about the estimate, or about the start."""
     fit = fitted(spec, files, stated)
-    model = fit.given.problem.measurement
+    model = fit.given.model
+    if isinstance(model, ConstrainedModel):
+        # What is known of parameters is a key of the job, which goes on.
+        model = model.whole
+    if len(fit.given.rows) < model.m:
+        model = SubsetModel(model, tuple(fit.given.rows.tolist()))
     noise: Noise = noise_of(fit)
-    lines = [f"Noise: normal, {_level(fit)}, as estimated from the readings."]
-    if "noise" in stated:
+    source = "as stated"
+    if fit.given.noise.estimated:
+        source = "as estimated from the readings"
+    lines = [f"Noise: normal, {_level(fit)}, {source}."]
+    if "noise" in stated and not fit.given.noise.estimated:
         noise = spec.noise
         lines = []
     scale = spec.error_scale
-    if at_estimate:
-        names = [p.name for p in model.physical_parameters]
-        nominal = [
-            ParameterInfo(name, nominal=value)
-            for name, value in zip(names, fit.x.tolist(), strict=True)
-        ]
-        model = informed(model, nominal)
-        if "error_scale" not in stated:
-            scale = NEAR
-        values = ", ".join(f"{name} = {value:.4g}" for name, value in fit.values.items())
-        lines.append(f"Truths: about the estimate, {values} (error_scale={scale:g}).")
-    else:
+    known = dict(spec.parameters or {})
+    if not at_estimate:
         lines.append(
             f"Truths: simulated about the start (error_scale={scale:g}), not the readings of"
             f" {', '.join(files)}."
         )
-    return replace(spec, measurement=model, noise=noise, error_scale=scale), lines
+        return replace(spec, measurement=model, noise=noise), lines
+    if "error_scale" not in stated:
+        scale = NEAR
+    names = [p.name for p in fit.given.model.physical_parameters]
+    found = dict(zip(names, fit.x.tolist(), strict=False))
+    for name, value in found.items():
+        known[name] = {**known.get(name, {}), "nominal": value}
+    values = ", ".join(f"{name} = {value:.4g}" for name, value in found.items())
+    lines.append(f"Truths: about the estimate, {values} (error_scale={scale:g}).")
+    there = replace(spec, measurement=model, noise=noise, error_scale=scale, parameters=known)
+    return there, lines
 
 
 def _level(fit: Fit) -> str:

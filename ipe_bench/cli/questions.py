@@ -90,6 +90,8 @@ def _asked(name: str, arguments: Sequence[str], row: Row, files: Sequence[str]) 
     if files:
         spec, lines = like_these(spec, files, found.words.keys, at_estimate=row.at_estimate)
         say(*lines)
+        if found.words.standard_baselines:
+            spec = spec.suited()
     return Asked(found.measurement, spec.scenario, spec.estimators, trials, found.folder)
 
 

@@ -155,3 +155,13 @@ def test_the_bounds_of_a_design_are_the_standard_errors_of_the_estimate(ipe_benc
     rows = [line.split() for line in out.splitlines() if line.split()[:1] in (["a"], ["b"])]
     bounds = [float(row[1]) for row in rows]
     np.testing.assert_allclose(bounds, np.sqrt(np.diag(C)), rtol=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["run", "design", "posterior"])
+def test_exact_readings_have_no_noise_to_simulate(ipe_bench, folder: Path, command: str) -> None:
+    rows = [f"{t},{2 * t + 1}" for t in range(8)]
+    (folder / "exact.csv").write_text("\n".join(["t,y", *rows]) + "\n")
+    code, _, err = ipe_bench(command, "a*t + b", "exact.csv")
+    assert code == 2
+    assert "the residuals are zero" in err
