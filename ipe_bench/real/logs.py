@@ -20,6 +20,7 @@ from ipe_bench.basics.linalg import Array, Mask, deviations, unmasked
 from ipe_bench.basics.options import Finite, NonNegative, Positive, option_types
 from ipe_bench.basics.statuses import Status
 from ipe_bench.real.readings import TextTable, read_tables, unit_of
+from ipe_bench.real.residuals import OUTLIER_LEVEL
 from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel, require_parts
 from ipe_bench.states.copies import SURE
@@ -54,6 +55,10 @@ _POSITIVE = (Positive, NonNegative)
 _FAR_BELOW = 10.0
 """By how much more than a tenth of the number of readings a log likelihood lies far below the
 largest of the log."""
+_MOST_OUTLIERS = 5
+_FEW = 3
+_SHARE = 0.05
+"""Share of outliers above which the model is wrong, and no list of epochs helps."""
 _COLLAPSED = 2.0
 """Effective sample sizes below this have no covariance."""
 _TURNS = {"deg": 360.0, "°": 360.0, "rad": 2 * np.pi}
@@ -311,8 +316,8 @@ class LogTracks:
     found: str = ""
     """The verdict on the search for them; empty if one maximum was found."""
     notes: Sequence[str] = ()
-    """Constants that are held at 0, other maxima that the searches have found, and a second path
-    that fits."""
+    """Constants that are held at 0, other maxima that the searches have found, a second path that
+    fits, and the epochs of outliers."""
 
     @classmethod
     def of(cls, log: Log, label: str, tracker: Tracker) -> LogTracks:
@@ -368,7 +373,7 @@ class LogTracks:
             lost_from=lost_from,
             effective=effective,
             smooths=tracker.smooths,
-            notes=_second(log, tracks),
+            notes=[*_second(log, tracks), *_worst(log, nis, lost_from)],
         )
 
     @property
@@ -446,6 +451,24 @@ def _lost_from(nis: Array, degrees: Array) -> int | None:
     share = following / np.arange(len(at), 0, -1)
     lost = at[beyond & (share > 0.5)]
     return int(lost[0]) + 1 if len(lost) else None
+
+
+def _worst(log: Log, nis: Array, lost_from: int | None) -> list[str]:
+    """Words the epochs whose NIS (K,) is so large that chance has one in a whole log with a
+    probability of 1 %, the worst first; none if the track is lost or they are many."""
+    degrees = np.isfinite(log.z).sum(axis=1)
+    at = np.flatnonzero(np.isfinite(nis))
+    beyond = at[chdtrc(degrees[at], nis[at]) < OUTLIER_LEVEL / max(len(at), 1)]
+    if lost_from is not None or not 0 < len(beyond) <= max(_FEW, _SHARE * len(at)):
+        return []
+    listed = sorted(beyond, key=lambda k: -nis[k])[:_MOST_OUTLIERS]
+    epochs = ", ".join(f"{k + 1} (NIS {nis[k]:.3g})" for k in listed)
+    further = len(beyond) - len(listed)
+    others = f" and {further} more" if further else ""
+    return [
+        f"outliers, whose readings are further from their predictions than chance explains:"
+        f" epochs {epochs}{others}; empty a cell to leave its reading out"
+    ]
 
 
 def far_below(tracks: Sequence[LogTracks]) -> list[str]:

@@ -507,3 +507,17 @@ def test_estimates_of_constants_and_of_states_are_told_apart():
     constant = ib.measurements.Polynomial()
     with pytest.raises(ib.UserError, match=r"estimators: ekf: .* is a Filter; give an estimator"):
         ib.estimate(constant, np.zeros(constant.m), {"ekf": ekf()})  # pyright: ignore
+
+
+def test_the_worst_epochs_of_a_log_are_named():
+    """A spike of ten deviations at epoch 30, from which the filter has to come back at epoch 31; none
+    in the same log without it."""
+    model = replace(DRIVEN, next={"x": "x + w"}, inputs={}, count=60)
+    z = model.draw(0, 1, seed=3).z[0]
+    trackers = {"ekf": ekf(), "ekf_rts": Smoother(ekf())}
+    assert [one.notes for one in ib.estimate(model, z, trackers)] == [[], []]
+    z[29] += 10 * 0.6
+    filtered, _ = ib.estimate(model, z, trackers)
+    (said,) = filtered.notes
+    assert said.startswith("outliers, whose readings are further")
+    assert f"epochs 31 (NIS {filtered.nis[30]:.3g}), 30 (NIS {filtered.nis[29]:.3g});" in said
