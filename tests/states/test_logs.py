@@ -510,8 +510,8 @@ def test_estimates_of_constants_and_of_states_are_told_apart():
 
 
 def test_the_worst_epochs_of_a_log_are_named():
-    """A spike of ten deviations at epoch 30, from which the filter has to come back at epoch 31; none
-    in the same log without it."""
+    """A spike of ten deviations at epoch 30, from which the filter comes back at epoch 31; none in
+    the same log without it."""
     model = replace(DRIVEN, next={"x": "x + w"}, inputs={}, count=60)
     z = model.draw(0, 1, seed=3).z[0]
     trackers = {"ekf": ekf(), "ekf_rts": Smoother(ekf())}
