@@ -8,25 +8,22 @@ A trial that breaks down is NaN from then on and disturbs no other.
 from __future__ import annotations
 
 import functools
-import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import accumulate, pairwise
-from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, multiply
-from ipe_bench.engine import compiled
 from ipe_bench.engine.rows import RowFunction
 from ipe_bench.engine.scan import Step, gram
-from ipe_bench.engine.trace import Graph, Program, RowPrograms
+from ipe_bench.engine.trace import RowPrograms
 from ipe_bench.states.algebra import factor, half, triangular
 from ipe_bench.states.along import Recording
 from ipe_bench.states.base import Kept, Normal, StateModel
+from ipe_bench.states.layouts import Layout, Shape, full, named_step, packed, triangle, unpacked
 from ipe_bench.states.linearisation import Linearised, Rule, SigmaPoints, Taylor
 from ipe_bench.states.steps import (
     Law,
@@ -55,10 +52,6 @@ _NUMBERS = 4e6
 """Numbers of passes that are held at once."""
 _LANES = 8
 """Trials at least that are held at once: machine code takes no more time for them than for one."""
-_FILES = [Path(__file__), Path(__file__).with_name("steps.py")]
-
-
-_Places: TypeAlias = "tuple[tuple[bool, ...], ...]"
 
 
 class Kind(NamedTuple):
@@ -81,22 +74,6 @@ class Route(NamedTuple):
     """Triangular roots of their covariances (trials, 1 + K, n (n + 1) / 2)."""
 
 
-class Layout:
-    """Says where parts of a row of numbers lie."""
-
-    def __init__(self, **sizes: int) -> None:
-        ends = [*accumulate(sizes.values(), initial=0)]
-        self.size = ends[-1]
-        self.at = {name: slice(*at) for name, at in zip(sizes, pairwise(ends), strict=True)}
-
-    def part(self, rows: Array, name: str, *shape: int) -> Array:
-        part = rows[..., self.at[name]]
-        return np.ascontiguousarray(part.reshape(*part.shape[:-1], *shape) if shape else part)
-
-    def split(self, numbers: Sequence[Any]) -> dict[str, Sequence[Any]]:
-        return {name: numbers[at] for name, at in self.at.items()}
-
-
 @dataclass(frozen=True)
 class Sizes:
     """Lays out what the steps of n states and m readings take and give."""
@@ -105,68 +82,39 @@ class Sizes:
     m: int
     smooths: bool
 
-    @property
-    def half(self) -> int:
-        return self.n * (self.n + 1) // 2
-
     @cached_property
     def carried(self) -> Layout:
-        return Layout(x=self.n, F=self.half, log_likelihood=1, doubt=1)
+        return Layout(x=self.n, F=triangle(self.n), log_likelihood=1, doubt=1)
+
+    @cached_property
+    def moved(self) -> Layout:
+        """What a transition tells a step back."""
+        return Layout(moved=full(self.n, self.n), noise=triangle(self.n))
 
     @cached_property
     def told(self) -> Layout:
         """What a step back takes of an epoch."""
         n = self.n
-        update = {"X": n * self.m, "Y": n * n, "Z": self.half}
-        return Layout(x=n, F=self.half, e=self.m, **update, moved=n * n, noise=self.half)
+        read = {"X": full(n, self.m), "Y": full(n, n), "Z": triangle(n)}
+        return Layout(x=n, F=triangle(n), e=self.m, **read, **self.moved.shapes)
 
     @cached_property
     def shown(self) -> Layout:
         n = self.n
-        parts = {name: at.stop - at.start for name, at in self.told.at.items()}
+        parts = dict(self.told.shapes)
         if not self.smooths:
             parts = {name: parts[name] for name in ("x", "F", "e")}
-        return Layout(**parts, nis=1, predicted=self.m, deviation=self.m, covariance=n * n)
+        rest = {"predicted": self.m, "deviation": self.m, "covariance": full(n, n)}
+        return Layout(**parts, nis=1, **rest)
+
+    @cached_property
+    def unit(self) -> Layout:
+        """What a step back carries: the noise that is left of each state's unit noise."""
+        return Layout(u=self.n, S=triangle(self.n))
 
     @cached_property
     def back(self) -> Layout:
-        return Layout(x=self.n, F=self.half, covariance=self.n * self.n)
-
-
-def triangle(numbers: Sequence[Any], n: int) -> Rows:
-    """Returns the triangular matrix of its n (n + 1) / 2 numbers."""
-    rest = iter(numbers)
-    return [[next(rest) if j <= i else 0.0 for j in range(n)] for i in range(n)]
-
-
-def matrix(numbers: Sequence[Any], rows: int) -> Rows:
-    columns = len(numbers) // rows
-    return [list(numbers[i * columns : (i + 1) * columns]) for i in range(rows)]
-
-
-def flat(F: Rows) -> Vector:
-    """Lists the numbers of a triangular matrix."""
-    return [a for i, row in enumerate(F) for a in row[: i + 1]]
-
-
-def listed(A: Rows) -> Vector:
-    return [a for row in A for a in row]
-
-
-def packed(F: Array) -> Array:
-    """Returns the numbers (..., n (n + 1) / 2) of triangular matrices F (..., n, n)."""
-    return F[(..., *_triangle(F.shape[-1]))]
-
-
-def unpacked(numbers: Array, n: int) -> Array:
-    F = np.zeros((*numbers.shape[:-1], n, n))
-    F[(..., *_triangle(n))] = numbers
-    return F
-
-
-@functools.cache
-def _triangle(n: int) -> tuple[Array, Array]:
-    return np.tril_indices(n)
+        return Layout(x=self.n, F=triangle(self.n), covariance=full(self.n, self.n))
 
 
 def roots(P: Array) -> Array:
@@ -201,6 +149,9 @@ def law_of(rule: Rule, n: int) -> Law | None:
     return None
 
 
+_NOTHING = Layout()
+
+
 @dataclass(frozen=True)
 class _Form:
     """Describes the machine code of a step, as far as it depends on a model."""
@@ -210,241 +161,144 @@ class _Form:
     f: RowPrograms | None
     """None where the states stand still."""
     h: RowPrograms
-    state_periods: tuple[float, ...]
-    periods: tuple[float, ...]
-    G: _Places
-    """Which numbers of G are not 0 at every epoch."""
-    R: _Places
-    """Those of a root of R likewise."""
+    state_periods: Sequence[float]
+    periods: Sequence[float]
+    each: Layout
+    """The numbers of a trial and epoch."""
+    shared: Layout
+    """The numbers of an epoch."""
 
     @classmethod
-    def of(
-        cls,
-        model: StateModel,
-        kind: Kind,
-        f: RowPrograms | None,
-        h: RowPrograms,
-        G: Array,
-        R: Array,
-    ) -> _Form:
-        sizes = Sizes(model.n, model.readings_per_epoch, kind.smooths)
-        of_states = tuple(model.state_periods) or (0.0,) * sizes.n
-        periods = tuple(model.periods) or (0.0,) * sizes.m
-        gains, noise = (tuple(map(tuple, places.tolist())) for places in (G, R))
-        return cls(kind, sizes, f, h, of_states, periods, gains, noise)
+    def of(cls, passes: Passes, f: RowPrograms | None, h: RowPrograms, G: Array, R: Array) -> _Form:
+        model = passes.model
+        n = model.n
+        kind = passes.kind
+        path: dict[str, Shape] = {}
+        if kind.about:
+            path = {"before": n, "root": triangle(n), "here": n, "root_here": triangle(n)}
+        each = Layout(z=passes.sizes.m, **path)
+        of_f = 0 if f is None else f.values.inputs - n
+        noise: dict[str, Shape] = {"G": _places(G), "R": _places(R)}
+        shared = Layout(c=of_f, d=h.values.inputs - n, **noise)
+        periods = model.state_periods or (0.0,) * n, model.periods or (0.0,) * passes.sizes.m
+        return cls(kind, passes.sizes, f, h, *periods, each, shared)
 
-    @cached_property
-    def each(self) -> Layout:
-        """Lays out the numbers of a trial and epoch."""
-        n = self.sizes.n
-        if not self.kind.about:
-            return Layout(z=self.sizes.m)
-        half = self.sizes.half
-        return Layout(z=self.sizes.m, before=n, root=half, here=n, root_here=half)
-
-    @cached_property
-    def shared(self) -> Layout:
-        """Lays out the numbers of an epoch."""
-        of_f = 0 if self.f is None else self.f.values.inputs - self.sizes.n
-        of_h = self.h.values.inputs - self.sizes.n
-        return Layout(f=of_f, h=of_h, G=_count(self.G), R=_count(self.R))
-
-    def record(self) -> Program:
+    def step(self) -> Step:
         sizes = self.sizes
-        n = sizes.n
-        graph = Graph()
-        unknowns = {}
-        inputs = []
-        for kind in (sizes.carried, self.each, self.shared):
-            given = graph.inputs(f"{len(unknowns)} ", kind.size)
-            unknowns |= kind.split(given)
-            inputs += given
-        law = law_of(self.kind.rule, n)
+        return named_step(self.text, self, sizes.carried, self.each, self.shared, sizes.shown)
+
+    def text(
+        self,
+        x: Vector,
+        F: Rows,
+        z: Vector,
+        c: Vector,
+        d: Vector,
+        G: Rows,
+        R: Rows,
+        before: Vector | None = None,
+        root: Rows | None = None,
+        here: Vector | None = None,
+        root_here: Rows | None = None,
+        **carried: Vector,
+    ) -> dict[str, Any]:
+        law = law_of(self.kind.rule, len(x))
         assert law is not None
-        state = State([*unknowns["x"]], triangle(unknowns["F"], n))
-        before = here = None
-        if self.kind.about:
-            before = State([*unknowns["before"]], triangle(unknowns["root"], n))
-            here = State([*unknowns["here"]], triangle(unknowns["root_here"], n))
+        state = State(x, F)
         moved = None
         smooths = self.kind.smooths
         if self.f is not None:
-            f = _Recorded(self.f, [*unknowns["f"]], self.state_periods)
-            G = _filled(self.G, unknowns["G"])
-            linear = law(f, state, before or state)
+            f = _Recorded(self.f, c, self.state_periods)
+            linear = law(f, state, State(before, root) if before and root else state)
             state, moved = predicted(linear, law.noise(G, linear), smooths)
-            if here is not None:
-                state = State(near(state.x, here.x, self.state_periods), state.F)
-        h = _Recorded(self.h, [*unknowns["h"]], self.periods)
-        R = _filled(self.R, unknowns["R"])
-        z = [*unknowns["z"]]
-        linear = law(h, state, here or state)
+            if here:
+                state = State(near(state.x, here, self.state_periods), state.F)
+        h = _Recorded(self.h, d, self.periods)
+        linear = law(h, state, State(here, root_here) if here and root_here else state)
         found = updated(state, linear, law.noise(R, linear), z, self.periods, smooths)
         for _ in range(1, self.kind.iterations):
             linear = law(h, state, found.state)
             found = updated(state, linear, law.noise(R, linear), z, self.periods, smooths)
-        if self.kind.about and isinstance(law, Regression):
+        if here and isinstance(law, Regression):
             # Slopes by points about a path that is nearly known may be round-off themselves.
             found = found._replace(doubt=0.0)
-        return _program(graph, _outputs(sizes, unknowns, z, found, moved), inputs)
-
-    def step(self) -> Step:
-        each = self.each.size
-        shown = self.sizes.shown.size
-        return _made(self, self.sizes.carried.size, each, each, self.shared.size, shown)
+        return {**_shown(z, found, **carried), **_told_of_move(moved, len(x))}
 
 
-@dataclass(frozen=True)
-class _Back:
-    """Describes the machine code of a step back."""
-
-    sizes: Sizes
-
-    def record(self) -> Program:
-        n = self.sizes.n
-        graph = Graph()
-        given = graph.inputs("u ", n), graph.inputs("S ", self.sizes.half)
-        told = graph.inputs("told ", self.sizes.told.size)
-        parts = self.sizes.told.split(told)
-        after = Smoothed([*given[0]], triangle(given[1], n))
-        state = after.of(State([*parts["x"]], triangle(parts["F"], n)))
-        read = beside(matrix(parts["X"], n), matrix(parts["Y"], n), triangle(parts["Z"], n))
-        moved = beside(matrix(parts["moved"], n), triangle(parts["noise"], n))
-        before = after.before([*parts["e"]], read, moved)
-        shown = [*state.x, *flat(state.F), *listed(gram(state.F))]
-        outputs = [*before.u, *flat(before.S), *shown]
-        return _program(graph, outputs, [*given[0], *given[1], *told])
-
-    def step(self) -> Step:
-        sizes = self.sizes
-        carried = sizes.n + sizes.half
-        shown = sizes.back.size
-        return _made(self, carried, sizes.told.size, sizes.shown.size, 0, shown)
+def _places(some: Array) -> Shape:
+    return tuple(map(tuple, some.tolist()))
 
 
-@dataclass(frozen=True)
-class _Move:
-    """Describes the machine code of a transition whose linear form is given."""
-
-    sizes: Sizes
-    columns: int
-    """Of a root of its noise."""
-
-    @cached_property
-    def each(self) -> Layout:
-        n = self.sizes.n
-        return Layout(y=n, AF=n * n, N=n * self.columns)
-
-    def record(self) -> Program:
-        sizes = self.sizes
-        n = sizes.n
-        graph = Graph()
-        carried = graph.inputs("carried ", sizes.carried.size)
-        given = graph.inputs("given ", self.each.size)
-        parts = sizes.carried.split(carried) | self.each.split(given)
-        linear = Linear([*parts["y"]], matrix(parts["AF"], n), [], [])
-        state, moved = predicted(linear, matrix(parts["N"], n), sizes.smooths)
-        outputs = [*state.x, *flat(state.F), *parts["log_likelihood"], *parts["doubt"]]
-        shown = _told_of_move(moved, n) if sizes.smooths else []
-        return _program(graph, [*outputs, *shown], [*carried, *given])
-
-    def step(self) -> Step:
-        each = self.each.size
-        shown = self.sizes.told.size - self.sizes.told.at["moved"].start
-        shown *= self.sizes.smooths
-        return _made(self, self.sizes.carried.size, each, each, 0, shown)
+def _back(
+    u: Vector,
+    S: Rows,
+    x: Vector,
+    F: Rows,
+    e: Vector,
+    X: Rows,
+    Y: Rows,
+    Z: Rows,
+    moved: Rows,
+    noise: Rows,
+) -> dict[str, Any]:
+    """Steps back from an epoch to the one before."""
+    after = Smoothed(u, S)
+    state = after.of(State(x, F))
+    before = after.before(e, beside(X, Y, Z), beside(moved, noise))
+    return {**before._asdict(), **state._asdict(), "covariance": gram(state.F)}
 
 
-@dataclass(frozen=True)
-class _Read:
-    """Describes the machine code of an update whose linear form is given."""
-
-    sizes: Sizes
-    columns: int
-    """Of a root of its noise."""
-
-    @cached_property
-    def each(self) -> Layout:
-        n = self.sizes.n
-        m = self.sizes.m
-        return Layout(z=m, y=m, HF=m * n, M=m * self.columns, H=m * n)
-
-    def record(self) -> Program:
-        sizes = self.sizes
-        m = sizes.m
-        graph = Graph()
-        carried = graph.inputs("carried ", sizes.carried.size)
-        given = graph.inputs("given ", self.each.size)
-        parts = sizes.carried.split(carried) | self.each.split(given)
-        state = State([*parts["x"]], triangle(parts["F"], sizes.n))
-        linear = Linear([*parts["y"]], matrix(parts["HF"], m), [], matrix(parts["H"], m))
-        z = [*parts["z"]]
-        found = updated(state, linear, matrix(parts["M"], m), z, (), sizes.smooths)
-        outputs = _outputs(sizes, parts, z, found, None)
-        return _program(graph, outputs, [*carried, *given])
-
-    def step(self) -> Step:
-        each = self.each.size
-        return _made(self, self.sizes.carried.size, each, each, 0, self.sizes.shown.size)
+def _move(
+    x: Vector, F: Rows, y: Vector, AF: Rows, N: Rows, smooths: bool, **carried: Vector
+) -> dict[str, Any]:
+    """Steps along a transition whose linear form is given."""
+    state, moved = predicted(Linear(y, AF, [], []), N, smooths)
+    return {**carried, **state._asdict(), **_told_of_move(moved, len(x))}
 
 
-def _count(places: _Places) -> int:
-    return sum(map(sum, places))
+def _read(
+    x: Vector,
+    F: Rows,
+    z: Vector,
+    y: Vector,
+    HF: Rows,
+    M: Rows,
+    H: Rows,
+    smooths: bool,
+    **carried: Vector,
+) -> dict[str, Any]:
+    """Takes in readings whose linear form is given."""
+    found = updated(State(x, F), Linear(y, HF, [], H), M, z, (), smooths)
+    return {**_shown(z, found, **carried), **_told_of_move(None, len(x))}
 
 
-def _filled(places: _Places, numbers: Sequence[Any]) -> Rows:
-    """Returns a matrix with numbers at these places, and 0 elsewhere."""
-    rest = iter(numbers)
-    return [[next(rest) if there else 0.0 for there in row] for row in places]
+def _shown(z: Vector, found: Update, log_likelihood: Vector, doubt: Vector) -> dict[str, Any]:
+    """Names what an update carries on and shows."""
+    n = len(found.state.x)
+    m = len(z)
+    state, e, L, in_doubt, read = found
+    nis, told = scores(e, L)
+    X, Y, Z = ([row[a:b] for row in read] for a, b in ((0, m), (m, m + n), (m + n, m + 2 * n)))
+    return {
+        **state._asdict(),
+        "log_likelihood": [log_likelihood[0] + told],
+        "doubt": [np.maximum(doubt[0], in_doubt)],
+        "e": e,
+        "X": X,
+        "Y": Y,
+        "Z": Z,
+        "nis": [nis],
+        "predicted": [a - dot(row, e) for a, row in zip(z, L, strict=True)],
+        "deviation": [np.sqrt(dot(row, row)) for row in L],
+        "covariance": gram(state.F),
+    }
 
 
-def _made(
-    form: _Form | _Back | _Move | _Read,
-    carried: int,
-    each: int,
-    stride: int,
-    shared: int,
-    shown: int,
-) -> Step:
-    """Returns the step of a form, which is recorded only if its machine code is not kept."""
-    digests = [compiled.digest_of(file) for file in _FILES]
-    key = hashlib.sha256(repr((form, digests)).encode()).hexdigest()
-    return Step(key, form.record, carried, each, stride, shared, shown)
-
-
-def _program(graph: Graph, outputs: Sequence[Any], inputs: Sequence[Any]) -> Program:
-    # What is a number, or an input itself, becomes an expression.
-    return Program.of([graph.apply("add", a, 0.0) for a in outputs], inputs)
-
-
-def _outputs(
-    sizes: Sizes, carried: Mapping[str, Any], z: Vector, found: Update, moved: Rows | None
-) -> list[Any]:
-    """Lists what a step carries on and shows."""
-    n = sizes.n
-    m = sizes.m
-    state, e, L, doubt, read = found
-    nis, log_likelihood = scores(e, L)
-    now = [*state.x, *flat(state.F)]
-    log_likelihood = carried["log_likelihood"][0] + log_likelihood
-    doubt = np.maximum(carried["doubt"][0], doubt)
-    shown = [*now, *e]
-    if sizes.smooths:
-        X, Y, Z = ([row[a:b] for row in read] for a, b in ((0, m), (m, m + n), (m + n, m + 2 * n)))
-        shown += [*listed(X), *listed(Y), *flat(Z), *_told_of_move(moved, n)]
-    told = [a - dot(row, e) for a, row in zip(z, L, strict=True)]
-    deviations = [np.sqrt(dot(row, row)) for row in L]
-    return [
-        *(*now, log_likelihood, doubt),
-        *(*shown, nis, *told, *deviations, *listed(gram(state.F))),
-    ]
-
-
-def _told_of_move(moved: Rows | None, n: int) -> Vector:
-    """Lists what a transition tells a smoother; without one the noise stays what it was."""
+def _told_of_move(moved: Rows | None, n: int) -> dict[str, Rows]:
+    """Names what a transition tells a smoother; without one the noise stays what it was."""
     if moved is None:
         moved = beside(unit(n), zeros(n, n))
-    return [*listed([row[:n] for row in moved]), *flat([row[n:] for row in moved])]
+    return {"moved": [row[:n] for row in moved], "noise": [row[n:] for row in moved]}
 
 
 class Passed(NamedTuple):
@@ -482,7 +336,9 @@ class Passes(ABC):
 
     @cached_property
     def _back(self) -> Step:
-        return _Back(self.sizes).step()
+        told = self.sizes.told
+        layouts = (self.sizes.unit, told, _NOTHING, self.sizes.back)
+        return named_step(_back, "back", *layouts, stride=self.sizes.shown.size)
 
     def run(self, z: Array, route: Route | None, start: Normal | None) -> Passed:
         """Passes along readings z (trials, K, m) from the prior, or from other starts."""
@@ -490,11 +346,11 @@ class Passes(ABC):
         trials, K, _ = z.shape
         mean, root = self.start if start is None else (start.mean, roots(start.covariance))
         carry = np.zeros((trials, sizes.carried.size))
-        carry[:, sizes.carried.at["x"]] = mean
-        carry[:, sizes.carried.at["F"]] = root
         shown = np.empty((trials, 1 + K, sizes.shown.size))
         shown[:, 0] = 0.0
-        shown[:, 0, : sizes.n + sizes.half] = carry[:, : sizes.n + sizes.half]
+        for rows, layout in ((carry, sizes.carried), (shown[:, 0], sizes.shown)):
+            rows[:, layout.at["x"]] = mean
+            rows[:, layout.at["F"]] = root
         padded = np.empty((trials, 1 + K, z.shape[2]))
         padded[:, 0] = np.nan
         padded[:, 1:] = z
@@ -502,8 +358,8 @@ class Passes(ABC):
         if not self.kind.smooths:
             return Passed(shown, carry, None)
         # After the last epoch nothing is read: u = 0 and S = I.
-        after = np.zeros((trials, sizes.n + sizes.half))
-        after[:, sizes.n :] = packed(np.eye(sizes.n))
+        after = np.zeros((trials, sizes.unit.size))
+        after[:, sizes.unit.at["S"]] = packed(np.eye(sizes.n))
         back = np.empty((trials, 1 + K, sizes.back.size))
         self._back.run(after, shown, _NONE, back, K, -1, 1 + K)
         return Passed(shown, carry, back)
@@ -533,12 +389,12 @@ class _Together(Passes):
             read = _programs(h)
             key = id(moved), id(read)
             if key not in made:
-                form = _Form.of(model, kind, moved, read, G, R)
+                form = _Form.of(self, moved, read, G, R)
                 made[key] = form, form.step(), np.zeros((1 + K, form.shared.size))
             form, step, shared = made[key]
-            values = {"h": h.numbers[0], "R": noise[k][R]}
+            values = {"d": h.numbers[0], "R": noise[k][R]}
             if f is not None:
-                values |= {"f": f.numbers[0], "G": gains[k][G]}
+                values |= {"c": f.numbers[0], "G": gains[k][G]}
             for name, numbers in values.items():
                 shared[1 + k, form.shared.at[name]] = numbers
             if self.runs and self.runs[-1].step is step:
@@ -584,28 +440,39 @@ class _ByEpoch(Passes):
 
     def __init__(self, model: StateModel, kind: Kind) -> None:
         super().__init__(model, kind)
-        self._steps: dict[tuple[type, int], Step] = {}
+        self._step = functools.cache(self._made)
 
-    def _step(self, form: type[_Move | _Read], columns: int) -> Step:
-        if (form, columns) not in self._steps:
-            self._steps[form, columns] = form(self.sizes, columns).step()
-        return self._steps[form, columns]
+    def _made(self, text: Callable[..., Any], columns: int) -> Step:
+        """Returns the step of a transition or of readings with a root of noise of so many
+        columns."""
+        n = self.sizes.n
+        m = self.sizes.m
+        smooths = self.sizes.smooths
+        if text is _move:
+            each = Layout(y=n, AF=full(n, n), N=full(n, columns))
+            shown = self.sizes.moved if smooths else _NOTHING
+        else:
+            each = Layout(z=m, y=m, HF=full(m, n), M=full(m, columns), H=full(m, n))
+            shown = self.sizes.shown
+        recorded = partial(text, smooths=smooths)
+        what = text.__name__, smooths
+        return named_step(recorded, what, self.sizes.carried, each, _NOTHING, shown)
 
     def there(self, z: Array, route: Route | None, carry: Array, shown: Array) -> None:
-        told = self.sizes.told
-        still = 0.0
-        if self.kind.smooths:
-            still = np.concatenate([np.eye(self.sizes.n).ravel(), np.zeros(self.sizes.half)])
+        n = self.sizes.n
+        at = self.sizes.told.at
+        told = slice(at["moved"].start, at["noise"].stop)
+        still = np.concatenate([np.eye(n).ravel(), np.zeros(n * (n + 1) // 2)])
         for k in range(self.model.epochs):
             moved = still
+            before = here = None
+            if route is not None:
+                before, here = (self._state(route.mean[:, i], route.root[:, i]) for i in (k, k + 1))
             if self.model.moves(k):
-                at = None if route is None else self._state(route.mean[:, k], route.root[:, k])
-                to = None if route is None else route.mean[:, k + 1]
-                moved = self._moved(k, carry, at, to)
-            at = None if route is None else self._state(route.mean[:, k + 1], route.root[:, k + 1])
-            self._read(k, z[:, k + 1], carry, at, shown[:, k + 1])
+                moved = self._moved(k, carry, before, here)
+            self._read(k, z[:, k + 1], carry, here, shown[:, k + 1])
             if self.kind.smooths:
-                shown[:, k + 1, told.at["moved"].start : told.size] = moved
+                shown[:, k + 1, told] = moved
 
     def _state(self, mean: Array, root: Array) -> _States:
         return _States(mean, unpacked(root, self.sizes.n))
@@ -614,12 +481,12 @@ class _ByEpoch(Passes):
         at = self.sizes.carried.at
         return self._state(carry[:, at["x"]].copy(), carry[:, at["F"]])
 
-    def _moved(self, k: int, carry: Array, at: _States | None, to: Array | None) -> Array:
+    def _moved(self, k: int, carry: Array, before: _States | None, here: _States | None) -> Array:
         """Advances what is carried by a transition, and returns what that tells a smoother."""
         model = self.model
         rule = self.kind.rule
         state = self._carried(carry)
-        at = at or state
+        at = before or state
         nearest = model.nearest_state if model.state_periods else None
         law = rule.linearised(model.transition_into(k), at.x, at.F, nearest)
         if model.gain_by_state:
@@ -628,16 +495,16 @@ class _ByEpoch(Passes):
         else:
             N = law.noise_root(model.gain(k))
         y, AF = _at(law, state, at)
-        if to is not None:
-            y = model.nearest_state(y, to)
-        return self._run(_Move, N, carry, [y, AF])[:, 0]
+        if here is not None:
+            y = model.nearest_state(y, here.x)
+        return self._run(_move, N, carry, [y, AF])
 
-    def _read(self, k: int, z: Array, carry: Array, at: _States | None, shown: Array) -> None:
+    def _read(self, k: int, z: Array, carry: Array, here: _States | None, shown: Array) -> None:
         """Takes in readings z (trials, m), and fills what is shown (trials, s)."""
         model = self.model
         rule = self.kind.rule
         state = self._carried(carry)
-        at = at or state
+        at = here or state
         nearest = model.nearest if model.periods else None
         begun = carry.copy()
         for _ in range(self.kind.iterations):
@@ -653,25 +520,24 @@ class _ByEpoch(Passes):
             untold = self.kind.about and isinstance(rule, SigmaPoints)
             H = np.zeros(HF.shape) if untold else law.slopes(at.F)
             carry[:] = begun
-            given = [z, y, HF]
-            shown[:] = self._run(_Read, M, carry, given, [H])[:, 0]
+            shown[:] = self._run(_read, M, carry, [z, y, HF], [H])
             at = self._carried(carry)
 
     def _run(
         self,
-        form: type[_Move | _Read],
+        text: Callable[..., Any],
         noise: Array,
         carry: Array,
         before: Sequence[Array],
         after: Sequence[Array] = (),
     ) -> Array:
         trials = len(carry)
-        step = self._step(form, noise.shape[2])
+        step = self._step(text, noise.shape[2])
         parts = [part.reshape(trials, -1) for part in (*before, noise, *after)]
         each = np.concatenate(parts, axis=1)[:, None]
         out = np.empty((trials, 1, step.shown))
         step.run(carry, each, _NONE, out, 0, 1, 1)
-        return out
+        return out[:, 0]
 
 
 def _at(law: Linearised, state: _States, at: _States) -> tuple[Array, Array]:

@@ -323,7 +323,8 @@ def _route(path: Tracks, there: Passes) -> Route:
     """Returns the states of a path."""
     mean = np.concatenate([path.start.mean[:, None], path.mean], axis=1)
     # Tangents take no covariance.
-    root = np.zeros((*mean.shape[:2], there.sizes.half)) if path.root is None else path.root
+    size = there.sizes.unit.size - there.sizes.n
+    root = np.zeros((*mean.shape[:2], size)) if path.root is None else path.root
     return Route(mean, root)
 
 
