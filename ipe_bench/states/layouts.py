@@ -17,7 +17,8 @@ from ipe_bench.engine import compiled
 from ipe_bench.engine.scan import Step
 from ipe_bench.engine.trace import Graph, Program
 
-_FILES = [Path(__file__).with_name(name) for name in ("layouts.py", "passes.py", "steps.py")]
+_NAMES = ("layouts.py", "linearisation.py", "passes.py", "steps.py")
+_FILES = [Path(__file__).with_name(name) for name in _NAMES]
 
 Shape: TypeAlias = "int | tuple[tuple[bool, ...], ...]"
 """The length of a vector, or the places of a matrix whose numbers are kept; the others are 0."""
@@ -43,6 +44,12 @@ class Layout:
 
     def __repr__(self) -> str:
         return repr(self.shapes)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Layout) and repr(self) == repr(other)
+
+    def __hash__(self) -> int:
+        return hash(repr(self))
 
     def parts(self, numbers: Sequence[Any]) -> dict[str, Any]:
         """Returns the vectors and matrices that these numbers are."""

@@ -14,22 +14,25 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply, own
 from ipe_bench.basics.options import Component, Count, Finite, Positive
+from ipe_bench.engine.scan import Step, dot
 from ipe_bench.functions.judged import by_complex_steps
-from ipe_bench.states.algebra import half, over, symmetric, transposed, triangular
+from ipe_bench.states.algebra import half, over, transposed, triangular
+from ipe_bench.states.layouts import Layout, full, named_step, packed, triangle
+from ipe_bench.states.steps import plus
 
 _MOST_POINTS = 100_000
 """Points of a product rule at most."""
 _ROUND_OFF = 1e-14
 """Variances, in parts of those of the values, that are round-off of a sum over points."""
-_MOST_COLUMNS = 64
-"""Points up to which what they leave is a root of noise."""
+_FEW = 64
+"""Points up to which NumPy is fast, and what they leave is a root of noise."""
 Function = Callable[[Array], Array]
 Nearest = Callable[[Array, Array], Array]
 
@@ -148,19 +151,16 @@ class SigmaPoints(Rule):
         y = g(_spread(m, F, s))
         if nearest is not None:
             y = nearest(y, g(m)[..., None, :])
-        # With d = y - mean: M' = A F = sum c s d'.
         mean = np.matmul(w, y)
-        d = np.subtract(y, mean[..., None, :])
-        M = np.matmul(transposed(c[:, None] * s), d)
-        # What the law leaves of the points, which is no difference of large covariances.
-        d -= np.matmul(s, M)
-        if (c < 0).any():
-            W = symmetric(np.matmul(transposed(c[:, None] * d), d))
-            return Linearised(mean, transposed(M), W)
-        d *= np.sqrt(c)[:, None]
-        left = transposed(d)
-        few = len(w) <= _MOST_COLUMNS
-        return Linearised(mean, transposed(M), np.matmul(left, d), left if few else None)
+        if len(w) > _FEW:
+            return Linearised(mean, *_regressed(own(y), mean, s, c))
+        d = transposed(y - mean[..., None, :])
+        M = np.matmul(c * d, s)
+        left = d - np.matmul(M, s.T)
+        W = np.matmul(c * left, transposed(left))
+        # What is left is a root itself; of a negative weight there is none.
+        root = None if (c < 0).any() else np.sqrt(c) * left
+        return Linearised(mean, M, W, root)
 
     def mean(self, g: Function, m: Array, F: Array) -> Array:
         s, w, _ = self.weighted(m.shape[-1])
@@ -182,8 +182,74 @@ def _weighted(rule: SigmaPoints, n: int) -> tuple[Array, Array, Array]:
 
 
 def _spread(m: Array, F: Array, s: Array) -> Array:
-    """Returns the points m + F s (trials, p, n)."""
-    return m[..., None, :] + np.matmul(s, transposed(F))
+    """Returns the points m + F s (trials, p, n); many of them in a scan along these."""
+    if len(s) <= _FEW:
+        return m[..., None, :] + np.matmul(s, transposed(F))
+    trials, n = m.shape
+    states = Layout(x=n, F=triangle(n))
+    at = Layout(s=n)
+    step = _along_points(_spread_text, states, _NOTHING, at, Layout(y=n))
+    carry = np.concatenate([m, packed(F)], axis=1)
+    points = np.empty((trials, *s.shape))
+    step.run(carry, _NONE, s, points, 0, 1, len(s))
+    return points
+
+
+def _spread_text(x: Any, F: Any, s: Any) -> dict[str, Any]:
+    return {"x": x, "F": F, "y": plus(x, F, s)}
+
+
+def _regressed(y: Array, mean: Array, s: Array, c: Array) -> tuple[Array, Array]:
+    """Returns M = A F (trials, m, n) and W (trials, m, m) of values y (trials, p, m) at points, in
+    two scans along these: with d = y - mean,
+
+    M = sum c d s',   W = sum c (d - M s) (d - M s)',
+
+    which is no difference of large covariances."""
+    trials, points, m = y.shape
+    n = s.shape[1]
+    values = Layout(y=m)
+    at = Layout(s=n, c=1)
+    weighted = np.concatenate([s, c[:, None]], axis=1)
+    sums = Layout(mean=m, M=full(m, n))
+    carry = np.concatenate([mean, np.zeros((trials, m * n))], axis=1)
+    out = np.empty((trials, points, 0))
+    step = _along_points(_slopes_text, sums, values, at, _NOTHING)
+    step.run(carry, y, weighted, out, 0, 1, points)
+    M = sums.part(carry, "M", m, n)
+    rest = Layout(**sums.shapes, W=full(m, m))
+    carry = np.concatenate([carry, np.zeros((trials, m * m))], axis=1)
+    step = _along_points(_rest_text, rest, values, at, _NOTHING)
+    step.run(carry, y, weighted, out, 0, 1, points)
+    return M, rest.part(carry, "W", m, m)
+
+
+def _slopes_text(mean: Any, M: Any, y: Any, s: Any, c: Any) -> dict[str, Any]:
+    d = [c[0] * (a - middle) for a, middle in zip(y, mean, strict=True)]
+    rows = zip(M, d, strict=True)
+    return {
+        "mean": mean,
+        "M": [[a + b * e for a, e in zip(row, s, strict=True)] for row, b in rows],
+    }
+
+
+def _rest_text(mean: Any, M: Any, W: Any, y: Any, s: Any, c: Any) -> dict[str, Any]:
+    off = [a - middle for a, middle in zip(y, mean, strict=True)]
+    left = [d - dot(row, s) for d, row in zip(off, M, strict=True)]
+    rows = zip(W, left, strict=True)
+    moved = [[a + c[0] * b * e for a, e in zip(row, left, strict=True)] for row, b in rows]
+    return {"mean": mean, "M": M, "W": moved}
+
+
+@functools.cache
+def _along_points(
+    text: Callable[..., Any], carried: Layout, each: Layout, shared: Layout, shown: Layout
+) -> Step:
+    return named_step(text, text.__name__, carried, each, shared, shown)
+
+
+_NOTHING = Layout()
+_NONE = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
