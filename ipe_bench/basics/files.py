@@ -36,8 +36,8 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     except OSError as error:
         reason = error.strerror if error.errno is None else os.strerror(error.errno)
         raise StorageError(
-            f"{path.parent}: cannot be written to any more ({reason or error}); what was stored"
-            " before is whole, and the same command goes on from there"
+            f"{path.parent}: cannot be written to any more ({reason or error}); earlier results are"
+            " intact; run the same command to resume"
         ) from error
     finally:
         with contextlib.suppress(OSError):

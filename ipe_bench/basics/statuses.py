@@ -16,9 +16,9 @@ class Status(IntEnum):
 
     RUNNING = -1, "not finished"
     CONVERGED = 0, "the estimating equation holds within the tolerance"
-    STALLED = 1, "the steps became tiny before the estimating equation held"
+    STALLED = 1, "steps became tiny before the equation was solved"
     MAX_ITERATIONS = 2, "the iteration limit was reached"
-    DIVERGED = 3, "the iterate left every region where the model makes sense"
+    DIVERGED = 3, "the iterate left the model's valid region"
     NONFINITE = 4, "a reading or an estimate overflowed or was not a number"
     SINGULAR = 5, "a linear system had no unique solution"
     BUDGET = 6, "the budget of simulations was used up"

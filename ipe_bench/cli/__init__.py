@@ -81,7 +81,7 @@ def places_and_keys(
         if key not in kinds:
             raise UserError(f"{command}: {word}: {unknown(key, kinds, 'key')}")
         if key in found:
-            raise UserError(f"{command}: {word}: {key} stands there twice; give it once")
+            raise UserError(f"{command}: {word}: {key} is given twice")
         if not text:
             raise UserError(f"{command}: {word}: give it a value")
         value: Any = text

@@ -32,7 +32,7 @@ _ROWS = (
     ("still", "prior=NAME", "the distribution of the true parameters about the nominal point"),
     ("estimators", "solver=[A,B]", "iterative solvers of the estimating equation"),
     ("estimators", "baseline=[A,B]", "other estimators, on the same trials"),
-    ("moving", "state_model=NAME", "states that move, in place of a measurement"),
+    ("moving", "state_model=NAME", "a model of moving states, instead of a measurement model"),
     (
         "moving",
         "tracker=[A,B]",

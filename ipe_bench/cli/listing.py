@@ -128,7 +128,7 @@ def _describe_measurement(option: plugins.Option) -> None:
 
     try:
         if "???" in option.config.values():
-            raise UserError("an option is to be given")
+            raise UserError("choose an option")
         model = construct(option.config, "measurement")
         assert isinstance(model, Measurement)
         columns = ",".join(header(model))

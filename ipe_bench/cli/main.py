@@ -85,7 +85,7 @@ def _explain(error: BaseException, command: Sequence[str]) -> tuple[int, str]:
     from ipe_bench.plugins.discovery import blame
 
     if isinstance(error, KeyboardInterrupt):
-        kept = "what was computed is kept, and the same command goes on from there"
+        kept = "results are kept; run the same command to resume"
         return 130, f"stopped; {kept if command == ['run'] else 'the same command begins anew'}"
     if isinstance(error, UserError | StorageError):
         code = 2 if isinstance(error, UserError) else 1
@@ -96,8 +96,7 @@ def _explain(error: BaseException, command: Sequence[str]) -> tuple[int, str]:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             return (
                 1,
-                f"{where}: {reason}; what was stored before is whole, and the same command goes on"
-                " from there",
+                f"{where}: {reason}; earlier results are intact; run the same command to resume",
             )
         return (
             2,

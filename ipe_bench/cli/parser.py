@@ -283,7 +283,7 @@ class Parser(argparse.ArgumentParser):
             raise UserError(f"{self.command}: {word}: there is no such flag{meant}")
         if word.startswith("-"):
             raise UserError(f"{self.command}: {word}: {unknown(word, flags, 'flag')}")
-        raise UserError(f"{self.command}: {word}: is a word too many; see `{self.prog} --help`")
+        raise UserError(f"{self.command}: {word}: is not expected; see `{self.prog} --help`")
 
 
 def program() -> Parser:

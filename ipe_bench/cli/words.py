@@ -337,9 +337,7 @@ def _check_place(override: Override) -> None:
             )
     elif package is None or (group, package) == ("measurement", TRUTH):
         if added:
-            raise UserError(
-                f"{word}: {package or group} is there to be chosen, not added; leave out the +"
-            )
+            raise UserError(f"{word}: {package or group} exists already; remove the +")
     elif group not in plugins.PACKAGES:
         raise UserError(f"{word}: goes nowhere; write {group}={name}")
     elif not re.fullmatch(rf"{plugins.PACKAGES[group]}\.[^.]+", package):
@@ -380,7 +378,7 @@ def _check_choice(override: Override, groups: Groups) -> None:
                     f"+{group}@{plugins.PACKAGES[group]}.{name}_2={name} runs it again under a"
                     " label of its own"
                 )
-                raise UserError(f"{word}: {name} stands there twice and would run once; {remedy}")
+                raise UserError(f"{word}: {name} is given twice but would run once; {remedy}")
 
 
 def no_option(group: str, name: str, groups: Groups) -> str:

@@ -63,7 +63,7 @@ def _refusing() -> Iterator[None]:
         yield
     except (ImportError, OSError, RuntimeError) as error:
         raise UserError(
-            f"no machine code can be made here ({one_line(error)}): install the package llvmlite "
+            f"compilation is not available here ({one_line(error)}): install the package llvmlite "
             "again (pip install --force-reinstall llvmlite)"
         ) from error
 

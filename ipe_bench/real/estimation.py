@@ -55,10 +55,7 @@ class Question:
         if isinstance(given, tuple):
             names = [str(path) for path in given]
             if len(set(names)) < len(names):
-                raise UserError(
-                    f"readings=[{','.join(names)}]: names a file twice, and would count its"
-                    " readings twice"
-                )
+                raise UserError(f"readings=[{','.join(names)}]: lists a file twice")
             return open_together(given, model, self.known, self.ignored)
         if self.ignored:
             raise UserError(

@@ -374,7 +374,8 @@ def _require_residuals(levels: Levels, z: Array, r: Array, J: Array) -> None:
         if len(rows) - rank < len(levels.names):
             raise UserError(
                 f"noise=unknown: the {len(rows)} readings {told}are too few to determine"
-                f" {', '.join(levels.names)} beside {rank} parameters; state the noise, as in"
+                f" {', '.join(levels.names)} in addition to {rank} parameters; state the noise, as"
+                " in"
                 " noise.deviation=0.1, or let more readings share a level"
             )
         if not np.linalg.norm(r[rows]) > _LEAST_SHARE * np.linalg.norm(z[rows]):

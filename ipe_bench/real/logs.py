@@ -614,7 +614,7 @@ def found_and_tracked(
         )
     elif any(one.is_maximum and one.cost - best.cost < _ALIKE for one in others):
         found = SEVERAL_MAXIMA
-        message = "the log hardly distinguishes the maxima of the likelihood"
+        message = "several maxima fit the log almost equally well"
     return replace(
         track,
         constants=sought.constants(best),

@@ -252,7 +252,7 @@ def _with_text(table: TextTable, data: bytes) -> TextTable:
         lines = [(reader.line_num, row) for row in reader if any(c.strip() for c in row)]
     except csv.Error as error:
         raise table.error(
-            f"row {reader.line_num}: is not a readable CSV file ({error}); mend the quotes"
+            f"row {reader.line_num}: cannot be read as CSV ({error}); fix the quotes"
         ) from error
     if not lines:
         raise table.error("is empty")

@@ -82,7 +82,8 @@ class Summary(pd.DataFrame):
     def _folder(self) -> Path:
         if self._stored is None or not self._stored.folder.is_dir():
             raise UserError(
-                "this frame does not know its trials; take them from the one that `ib.run` returned"
+                "this frame was modified and lost its trials; take them from the one that `ib.run`"
+                " returned"
             )
         return self._stored.folder
 

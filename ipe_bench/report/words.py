@@ -11,8 +11,7 @@ from ipe_bench import __version__
 
 CITATION = (
     f"The ipe-bench developers (2026). ipe-bench, version {__version__} [computer program]. Beside"
-    " it, state the command, the git commit and the source's digest that stand with the"
-    " provenance."
+    " it, state the command, the git commit and the source's digest listed under provenance."
 )
 """Citation of the bench."""
 _MOST_FIGURES = 12

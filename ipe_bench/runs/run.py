@@ -172,7 +172,7 @@ def _without_paths(scenario: StateScenario) -> Iterator[str]:
     if not finite(few.x).any():
         yield (
             f"state_model={scenario.model.name}: none of the first {_FEW} paths has finite states;"
-            " mend the transition, or choose another start or narrower spreads"
+            " fix the transition, or choose another start or narrower spreads"
         )
     elif not np.isfinite(few.z).any():
         yield (

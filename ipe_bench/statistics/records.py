@@ -58,10 +58,7 @@ def given_of(footer: Mapping[str, Any]) -> str:
     return "prior" if footer["bound"] == "bayes" else "readings"
 
 
-_CLAIMS = (
-    "converged trials with a reported covariance: a trial that the estimator itself gives up on"
-    " makes no claim"
-)
+_CLAIMS = "converged trials with a reported covariance: reported failures are excluded"
 
 STATISTICS: tuple[Statistic, ...] = (
     Statistic(
@@ -293,8 +290,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Share of trials that may have larger errors than those seen: the upper limit (95 %,"
         f" Clopper and Pearson) of the share of errors that {intervals.UNUSUAL:g} of normal ones"
         " with the same median exceed, less the share seen; about 3 / N where none of N trials has"
-        f" one, and 0 from {intervals.RARE} on. No interval of the root mean square knows of"
-        " errors that are so rare.",
+        f" one, and 0 from {intervals.RARE} on. No RMSE interval can include such rare errors.",
         f.rmse_unseen,
         kind="share",
     ),
@@ -674,7 +670,7 @@ SCORES: tuple[Statistic, ...] = (
         "the trials that every estimator of the scenario has",
         "Mean Mahalanobis error sqrt(e' J' R⁻¹ J e), the error in standard deviations of the"
         " Cramér-Rao bound, about √n when efficient; each trial's counts at most the radius of the"
-        " gate of success, so that failing badly is failing once.",
+        " gate of success, so one bad failure counts as one.",
         f.capped_error,
         where=("all_trials",),
     ),

@@ -99,7 +99,7 @@ def _width_of_rmse(sample: Sample) -> float:
 
 def _words_of_rmse(sample: Sample, width: float) -> str:
     if math.isinf(width):
-        return "anything, since a few trials carry it or there are too few"
+        return "too few trials, or a few dominate"
     words = f"{100 * width:.2g} %"
     rare = float(rmse_unseen(sample)[sample.n])
     if rare > 0:

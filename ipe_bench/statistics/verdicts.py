@@ -56,7 +56,7 @@ VERDICTS = (
         "too cautious",
         "-",
         "The reported covariance is too large: the mean NEES lies significantly (95 %) below the"
-        " number of parameters, even if errors that no trial shows are large.",
+        " number of parameters, even allowing for rare unseen errors.",
     ),
     Word(
         CONSISTENT,
@@ -84,8 +84,7 @@ VERDICTS = (
         "wrong (not white)",
         "!",
         f"Successive innovations of a filter are correlated: a log has p below {FIT_LEVEL:g}, or"
-        " significantly more than 1 % of the simulated trials have. The size of the innovations"
-        " then proves nothing.",
+        " significantly more than 1 % of the simulated trials have. NIS is then not a valid test.",
     ),
     Word(
         NO_VERDICT,

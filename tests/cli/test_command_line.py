@@ -497,7 +497,7 @@ def test_an_estimate_draws_nothing_where_no_figures_are_asked_for_and_overwrites
     (tmp_path / "out" / "residuals.csv").write_text("mine")
     code, _, error = ipe_bench(*words, "baseline=[gauss_newton]")
     assert code == 2
-    assert "output=out: holds results of another command" in error
+    assert "output=out: contains results of another command" in error
     assert (tmp_path / "out" / "residuals.csv").read_text() == "mine"
 
 
@@ -516,7 +516,7 @@ def test_a_taken_folder_is_refused_before_a_log_is_tracked(tmp_path, ipe_bench, 
         "estimate", "state_model=pendulum_book", "tracker=[ekf]", "output=out"
     )
     assert code == 2
-    assert "output=out: holds results of another command" in error
+    assert "output=out: contains results of another command" in error
 
 
 def test_the_bare_program_and_every_command_have_help(capsys):

@@ -201,7 +201,7 @@ MISTAKES = {
     "all fixed": (("readings=my.csv", "parameters.b1.fixed=1", "parameters.b2.fixed=1"),
                   "parameters: all are fixed"),
     "no start": (("readings=my.csv", "~measurement.start.b2"), "start"),
-    "one file twice": (("readings=[my.csv,my.csv]",), "names a file twice"),
+    "one file twice": (("readings=[my.csv,my.csv]",), "lists a file twice"),
     "a number for a column": (("readings=my.csv", "ignore_columns=[3]"), "ignore_columns"),
     "no such file": (("readings=my.csv", "parameters=no.yaml"),
                      "parameters=no.yaml: cannot be read"),

@@ -244,7 +244,7 @@ def test_an_experiment_has_no_function_called(ipe_bench, below_hydra):
 
 
 @pytest.mark.parametrize(
-    ("command", "said"), [("run", "goes on from there"), ("estimate", "begins anew")]
+    ("command", "said"), [("run", "the same command to resume"), ("estimate", "begins anew")]
 )
 def test_a_command_that_is_stopped_exits_as_a_shell_says_of_ctrl_c(
     ipe_bench, monkeypatch, command, said

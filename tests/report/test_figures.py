@@ -678,7 +678,7 @@ def test_a_row_per_setting_has_its_error_and_the_share_of_misfits_detected():
     told = [text for text in texts if "detected" in text]
     shares = (100, 0, 0)
     assert told == [f"{n}: detected in {s}\u00a0%" for n, s in zip(names, shares, strict=True)]
-    assert "Red: a wrong model detected in fewer than half" in drawing.caption
+    assert "Red: model error detected in under half" in drawing.caption
     assert len(drawing.caption.split()) <= 30
     drawing.figure.draw_without_rendering()
     assert all(text.get_bbox_patch() for text in ax.texts)  # no line crosses a letter

@@ -29,11 +29,11 @@ class AuditAnswer(Shown, Audit):
         ]
         joint = "No covariances are reported, so directions are not judged."
         if self.claims.joint:
-            joint = "The first sentence is of all parameters together, by the whole covariance."
+            joint = "The headline covers all parameters jointly."
         notes = [
             "true over reported is the root mean square of errors in reported standard deviations,"
-            " 1 if the report is right; bias is their mean. Intervals hold for all parameters"
-            " together, and for heavy tails.",
+            " 1 if the report is right; bias is their mean. Intervals are joint, and valid for"
+            " heavy tails.",
             joint,
         ]
         title = f"Audit of {self.claims.runs} runs"

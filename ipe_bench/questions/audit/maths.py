@@ -289,7 +289,7 @@ def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
         only = "" if scale.value > 1 else "only "
         return f"True errors are {only}{scale.words}: the covariance is {scale.verdict}."
     if scale.verdict == "right":
-        return f"True errors are {scale.words}: the covariance can be believed."
+        return f"True errors are {scale.words}: no evidence against the covariance."
     # The logarithm of the mean NEES has the variance v / runs, and a factor f moves it by 2 log f:
     # runs = v ((z_level + z_power) / (2 log f))^2.
     mean = claims.per_run(nees[:, None])[:, 0]
@@ -297,8 +297,8 @@ def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
     errors = ndtri(1 - ALPHA / 4) + ndtri(0.8)
     needed = np.ceil(spread * (errors / (2 * np.log(MATTERS))) ** 2)
     return (
-        f"True errors are {scale.words}: {claims.runs} runs do not decide if the covariance is"
-        " right; a standard deviation that is wrong by 10 % would be detected in"
+        f"True errors are {scale.words}: {claims.runs} runs are too few to judge the covariance; a"
+        " standard deviation that is wrong by 10 % would be detected in"
         f" {needed:.0f} runs."
     )
 

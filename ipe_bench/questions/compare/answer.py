@@ -73,9 +73,9 @@ class Comparison(Shown, pd.DataFrame):
             "error is the length of the error of all parameters, in standard deviations of the"
             " bound (Mahalanobis), at most the radius of the gate of success; cost counts"
             " simulations. Both are means over the common trials; the table of a run has medians,"
-            " and errors over the bound. p comes from McNemar's exact test for success and from"
-            " random signs for the others, with Holm's correction over all tests. e is evidence"
-            " that may be looked at repeatedly; e = 20 is as rare as p = 0.05. Each interval holds"
+            " and errors over the bound. p comes from McNemar's exact test for success and"
+            " sign-flip tests for the rest, with Holm's correction over all tests. e-values stay"
+            " valid under repeated looks; e = 20 is as rare as p = 0.05. Each interval holds"
             " for its row alone. Times are not tested. Between an estimator with a prior and one"
             " without, success is by the gate of the Cramér-Rao bound; in the table of a run each"
             " has the gate of its own bound."
@@ -187,7 +187,7 @@ def _extent(found: Sequence[dict[str, Any]], number: int, interval: str) -> str:
 def _needed(row: dict[str, Any]) -> str:
     return (
         f"{row['trials_needed']:,} trials find a difference of {100 * row['difference']:g} % in"
-        f" success with a probability of {100 * row['power']:g} %: one alone succeeds in"
+        f" success with a probability of {100 * row['power']:g} %: only one of the two succeeds in"
         f" {row['discordant']} of {row['trials']} trials, so in at most"
         f" {percent(row['discordant_high'])} of all (80 % limit)."
     )

@@ -338,7 +338,8 @@ def _matches(
     for collection in (first, second):
         if not collection.groups:
             raise UserError(
-                f"{_where(collection)}: holds no trials to compare; `ipe-bench status` lists what"
+                f"{_where(collection)}: contains no trials to compare; `ipe-bench status` lists"
+                " what"
                 " is missing"
             )
     scenarios = list(_in_both(first, second))

@@ -225,7 +225,7 @@ def _suspects(design: Design) -> Iterator[Part]:
     note = (
         f"detected: share of trials in which the test of fit at {FIT_LEVEL:g} reports the error."
         " An error is hidden if it makes a parameter wrong by more than its bound and is detected"
-        " in less than half of the trials. The readings hardly change along the unseen direction."
+        " in less than half of the trials. The unseen direction barely changes the readings."
     )
     columns = [
         words("error", [s.name for s in shown]),
@@ -246,8 +246,9 @@ def _unseen(design: Design) -> Iterator[str]:
         return
     worst = unseen[0]
     yield (
-        f"Tests of residuals will not detect {enumerate_few([s.name for s in unseen])}, which"
-        f" parameters imitate. {worst.parameter} will be wrong by {worst.bounds:.3g} bounds where"
+        f"Tests of residuals will not detect {enumerate_few([s.name for s in unseen])}, which look"
+        f" like parameter changes. {worst.parameter} will be wrong by {worst.bounds:.3g} bounds"
+        " where"
         f" {worst.name} is {worst.deviation:.3g} {worst.unit}."
     )
 
@@ -282,9 +283,8 @@ def _ways(design: Design) -> Iterator[Part]:
         f" {design.criterion})"
     )
     note = (
-        f"fewest readings is the number whose bound is no larger than today's {today}. Among"
-        f" {design.candidates.m} candidates those that gain most are taken one after another;"
-        " another choice may be slightly better."
+        f"fewest readings is the number whose bound is no larger than today's {today}. Chosen"
+        " greedily from the candidates; a slightly better set may exist."
     )
     yield Table("ways", title, "", columns, notes=[note])
     for way in design.ways:

@@ -40,10 +40,7 @@ def answer(asked: Asked, at: str | None = None, **given: Any) -> Answered:
 
     scenario = asked.scenario
     if scenario.noise.real:
-        raise UserError(
-            "noise=certified: a design is of readings that are still to be taken; choose another"
-            " noise"
-        )
+        raise UserError("noise=certified: design plans future readings; choose another noise")
     errors = richer_models(scenario)
     point = None if at is None else _estimates(at)
     identity = {

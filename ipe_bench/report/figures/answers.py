@@ -71,7 +71,7 @@ def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
     ax.set_xlabel(common.text(name))
     ax.set_ylabel(common.text(with_unit(model.reading_name, model.reading_unit)))
     common.legend(fig, [ax])
-    caption = "At any one point the band holds the curve, to first order in the parameters' errors."
+    caption = "Pointwise 95 % band, first order in the errors."
     yield Drawing("fit", "Readings and fitted curve", caption, fig)
 
 

@@ -49,7 +49,7 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         fig,
         "cost_against_accuracy",
         "Cost against accuracy, all trials",
-        "Down and left is better; equal costs stand side by side.",
+        "Lower left is better.",
         common.left_out(view.scales, panels),
         _cheapest(rows, view.scales[-1]),
     )

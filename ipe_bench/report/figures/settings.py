@@ -126,7 +126,7 @@ def _rows(view: View, rows: pd.DataFrame, scale: float) -> Iterator[Drawing]:
         "settings",
         f"Error by setting at error scale {scale:g}",
         "Median error, bar to the 95 % quantile. Detected: the test of fit rejects the model, in %"
-        " of trials. Red: a wrong model detected in fewer than half.",
+        " of trials. Red: model error detected in under half of trials.",
     )
 
 

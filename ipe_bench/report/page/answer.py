@@ -234,10 +234,7 @@ class Answer(Labelled[Fit]):
         if passing[0].exact:
             tests = "the only test that readings without noise allow: residuals are round-off"
         elif not passing[0].fits:
-            tests = (
-                "the available tests; the size of the residuals is not tested, for the noise level"
-                " is unknown"
-            )
+            tests = "the available tests (the size of residuals cannot be tested: noise unknown)"
         said = []
         if tested:
             said.append(f"Passing {tests}: {tested}")
@@ -368,7 +365,7 @@ def _notes(answer: Answer) -> Iterator[str]:
         yield f"Left out on purpose: columns {answer.left_out}."
     failing = _labels(one for one in fits if not one.passes)
     if failing:
-        yield f"Values in brackets are no answers and have no standard errors: {failing}."
+        yield f"Values in parentheses were rejected and have no standard errors: {failing}."
 
 
 def _labels(fits: Iterable[Fit]) -> str:
@@ -379,12 +376,9 @@ def _notes_on_fit(one: Fit) -> Iterator[str]:
     if one.label == SEARCH:
         yield f"{SEARCH}: Levenberg-Marquardt steps from the best of further starts."
     if one.beaten_by:
-        yield (
-            f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this"
-            " is no answer."
-        )
+        yield (f"{one.label}: {one.beaten_by} found a significantly better fit; rejected.")
     if one.lower_at:
-        yield f"{one.label}: {one.lower_at} ended at a lower minimum, which is the better answer."
+        yield f"{one.label}: {one.lower_at} found a lower minimum; use that answer."
     for k, (low, high) in one.between.items():
         name = one.model.physical_parameters[k].name
         yield (
@@ -397,7 +391,7 @@ def _notes_on_fit(one: Fit) -> Iterator[str]:
         at = {parameters[k].name: value for k, value in one.held_at.items()}
         yield (
             f"{one.label}: on its bound: {_values(at)}; the readings favour a value beyond. It has"
-            " no error, and the errors of the others hold it there."
+            " no standard error; the others are computed with it fixed."
         )
 
 
@@ -409,12 +403,12 @@ def _notes_on_noise(answer: Answer) -> Iterator[str]:
         yield (
             "The noise levels are estimated with the parameters by restricted maximum likelihood."
             " They make chi-square equal to the degrees of freedom, so the size of the residuals"
-            " cannot test the model. Three things can: white p, outliers, and a comparison of the"
-            " levels with each other and with what is known of the instruments."
+            " cannot test the model. Check white p, outliers, and the levels against the"
+            " instruments' specifications."
         )
         known = _labels(one for one in fits if one.estimated and not one.estimated.maximal)
         if known:
-            yield f"{known}: takes the levels of its own residuals as known."
+            yield f"{known}: treats its estimated noise levels as exact."
     exact = _labels(one for one in fits if one.exact)
     if exact:
         yield (
@@ -443,7 +437,7 @@ def _notes_on_noise(answer: Answer) -> Iterator[str]:
         )
     if answer.examination is not None and answer.examination.overstated:
         yield (
-            "By noise that is so far overstated no interval means anything, and none is computed:"
+            "The stated noise is far too large, so no intervals are computed:"
             " state the noise of these readings, or choose noise=unknown, whose level is"
             " estimated."
         )
@@ -452,9 +446,7 @@ def _notes_on_noise(answer: Answer) -> Iterator[str]:
 def _notes_on_priors(answer: Answer) -> Iterator[str]:
     told = _labels(one for one in answer.fits if one.with_prior)
     if told:
-        yield (
-            f"{told}: with a prior, which counts in the standard errors as further readings would."
-        )
+        yield (f"{told}: with a prior; standard errors include it.")
     elif isinstance(answer.model, ConstrainedModel):
         stated = [one.name for one in answer.model.known if one.deviation is not None]
         if stated:
@@ -565,13 +557,13 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         if shift[i] >= _INFLUENTIAL:
             where = _where(labels[i])
             yield (
-                f"Without the reading {where} a parameter would move by {shift[i]:.1f} standard"
+                f"Dropping the reading at {where} moves one parameter by {shift[i]:.1f} standard"
                 " errors."
             )
     drawn = found.bootstrap.drawn
     lost = drawn - found.bootstrap.converged
     if lost > 0:
-        yield f"Bootstrap: {lost} of {drawn} simulated sets of readings gave no estimate."
+        yield f"Bootstrap: {lost} of {drawn} simulated data sets gave no estimate."
 
 
 def _other_minima(found: Examination, names: Sequence[str]) -> Iterator[str]:
@@ -604,12 +596,12 @@ def _on_profiles(found: Examination, names: Sequence[str]) -> Iterator[str]:
         yield f"The model is strongly nonlinear here: use the {level} profile intervals, {ends}."
     unlimited = list(compress(names, np.any(np.isinf(found.profiles), axis=0)))
     if unlimited:
-        yield f"The readings set no limit to one side of {', '.join(unlimited)}."
+        yield f"The readings do not bound one side of {', '.join(unlimited)}."
     lost = list(compress(names, np.any(np.isnan(found.profiles), axis=0)))
     if lost:
         yield (
-            f"An end of the profile is missing: {', '.join(lost)}; a better fit, or no minimum,"
-            " was met on the way."
+            f"An end of the profile is missing: {', '.join(lost)}; the search met a better fit, or"
+            " no minimum."
         )
 
 

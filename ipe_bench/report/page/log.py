@@ -28,8 +28,8 @@ TABLE = "track.csv"
 SCHEMA = 1
 _NOTE = (
     "Innovations are readings less their predictions, in predicted standard deviations, and NIS /"
-    " m (normalised innovation squared, per reading) is their mean square. A smoother has none: it"
-    " is judged by the cost of its path, and one behind a filter by NIS and whiteness of that"
+    " m (normalised innovation squared, per reading) is their mean square. Smoothers are judged by"
+    " the cost of their path, and one behind a filter by NIS and whiteness of that"
     " filter. If the model is right both are chi-square with a degree per reading, and fit p is"
     " the probability of larger ones. Innovations are white if the filter is right (Ljung and"
     " Box). The verdict is on innovations alone: an error that readings do not show, such as the"
@@ -43,8 +43,8 @@ _OF_PARTICLES = (
     " 2."
 )
 _OF_CONSTANTS = (
-    f" Constants have the largest likelihood that {SEARCHES} searches found. Since innovations"
-    " determined them, the mean square of innovations hardly tests the model; whiteness does."
+    f" Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
+    " the innovations, so only whiteness tests the model."
 )
 _STORED = (
     *("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict"),

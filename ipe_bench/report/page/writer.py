@@ -50,7 +50,7 @@ def reserved_folder(
     while not _is_free(place, result, command, files):
         if not elsewhere:
             raise UserError(
-                f"output={folder}: holds results of another command, which are not overwritten;"
+                f"output={folder}: contains results of another command; it is not overwritten;"
                 " choose another folder, or remove it"
             )
         number += 1

@@ -25,8 +25,8 @@ from ipe_bench.statistics.registry import all_statistics
 from ipe_bench.statistics.statistic import ALL, Where, frame_columns
 
 _OPEN = (
-    " An interval of one end (> or <) stands where larger errors may be unseen, in 3 of N trials"
-    " or fewer; rmse_solved_unseen in summary_all.csv is that share."
+    " > or <: one-sided interval, because errors in up to 3 of N trials may be unseen;"
+    " rmse_solved_unseen in summary_all.csv is that share."
 )
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "tracks": (
@@ -58,15 +58,15 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     ),
     "all_trials": (
         "All trials",
-        "Over all trials, the same for every estimator. A single trial may decide the root mean"
-        " square error and the uncapped efficiency.",
+        "Over all trials, the same for every estimator. One trial can dominate the RMSE and the"
+        " uncapped efficiency.",
         lambda rows: rows["trials"] > 0,
     ),
     "solved_trials": (
         "Solved trials",
         "This table diagnoses estimators that solve an equation and does not compare them with"
         " others: each row is over the trials in which the estimator found the root that belongs"
-        f" to the truth. Their number stands in brackets if it is not all.{_OPEN}",
+        f" to the truth. In parentheses: their number, if not all.{_OPEN}",
         lambda rows: rows["equation"] != "-",
     ),
     "covariances": (
@@ -227,7 +227,7 @@ def endings(analysis: Analysis) -> Table | None:
     columns += _counts(rows, "trials")
     columns.append(column("share", rows["share"], percent))
     columns += _texts(rows, "first", "message")
-    caption = "How trials ended that did not converge, and the first of each kind."
+    caption = "Trials that did not converge, by reason, with the first example of each."
     return Table("endings", "Trials that did not converge", caption, columns, rows)
 
 

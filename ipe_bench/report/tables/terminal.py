@@ -48,10 +48,10 @@ _HEAD = 4
 _WIDE_ENOUGH = 100
 """Letters of a screen with room for failures, and for verdicts spelt out."""
 _LEGEND = (
-    "success: % of all trials (95 % interval); bold: not significantly worse than the best, unless"
-    " this holds for all{failed}; error: median / 95 % quantile over {reference}; efficiency, NEES"
-    " (mean; in brackets the converged trials): 1 is ideal{sign}; cost: simulations of a trial,"
-    " median/mean if they differ; time: mean of a trial. More: ipe-bench list statistic."
+    "success: % of all trials (95 % interval); bold: best, or tied for best{failed}; error: median"
+    " / 95 % quantile over {reference}; efficiency, NEES"
+    " (mean; in brackets the converged trials): 1 is ideal{sign}; cost: simulations per trial,"
+    " median (mean where it differs); time: mean of a trial. More: ipe-bench list statistic."
 )
 _FAILED = "; failed: known / undetected, %"
 _SPELT_OUT = (
@@ -65,9 +65,9 @@ _TOLD = (
     " levels."
 )
 TRACKED = (
-    "States that move: all columns hold at the last epoch, where filters and smoothers have the"
-    " same readings. Success: the error lies in the gate (all but one in a million) of a filter"
-    " linearised at the true path. The table of all epochs has the whole path. Cost: evaluations"
+    "All columns are for the last epoch, where filters and smoothers have the same readings."
+    " Success: the error lies in the gate (all but one in a million) of a filter"
+    " linearised at the true path. For whole paths see the table of all epochs. Cost: evaluations"
     " of transition and reading."
 )
 """References of a track's errors."""

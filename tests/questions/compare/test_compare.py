@@ -394,13 +394,13 @@ MISTAKES = {
     "{a} nowhere": "nowhere: there is no such folder",
     "{a} {b} alpha=2": "between 0 and 1", "{a} {b} alpha=x": "alpha=x: give a number",
     "{a} {b} alfa=0.1": "did you mean alpha", "{a} {b} alpha=": "give it a value",
-    "{a} {b} first=it first=it": "stands there twice", "{a} {b} anytime=1": "true or false",
+    "{a} {b} first=it first=it": "is given twice", "{a} {b} anytime=1": "true or false",
     "{a} {b} fail_on=time": "there is no such quantity",
     "{a} {b} margin.time=1": "there is no such key",
     "{a} {b} margin.cost=-1": "margin.cost=-1.0: give a number from 0 on",
     "{a} {b} fail_on=cost power=0.9 difference=0.05": "power: concerns success",
     "{a} {b} first=nobody": "there is no such estimator", "{a} {other}": "no estimator is in both",
-    "{a} {model}": "no scenario in common", "{a} {empty}": "holds no trials",
+    "{a} {model}": "no scenario in common", "{a} {empty}": "contains no trials",
     "{a} {b} --force": "there is no such flag",
 }
 # fmt: on
