@@ -20,7 +20,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import say
 from ipe_bench.cli import words as w
 from ipe_bench.cli.keys import OF_FILES, SETTING_NOTHING
-from ipe_bench.cli.parser import parser_of
+from ipe_bench.cli.parser import COMMANDS, parser_of
 from ipe_bench.cli.results import show_report
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
 from ipe_bench.cli.single import require_one_kind
@@ -89,7 +89,7 @@ def run_command(arguments: Sequence[str]) -> int:
     folder = None if flags.config_dir is None else Path(flags.config_dir)
     with session(folder, flags.config_name):
         if flags.shell_completion:
-            complete(flags.overrides)
+            complete(flags.overrides, COMMANDS)
             return 0
         typed = [*_rerun(flags.experimental_rerun), *flags.overrides]
         swept = [w.swept(word) for word in typed]

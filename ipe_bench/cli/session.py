@@ -12,7 +12,7 @@ import functools
 import itertools
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -270,8 +270,9 @@ def show(words: Words, flags: Any) -> None:
         _hydra().show_cfg(PluginConfigs.name, settled, flags.cfg, flags.package, flags.resolve)
 
 
-def complete(words: Sequence[str]) -> None:
-    """Installs Hydra's completion, or answers a shell, which sets COMP_LINE."""
+def complete(words: Sequence[str], commands: Collection[str]) -> None:
+    """Installs Hydra's completion, or answers a shell, which sets COMP_LINE, with our commands or
+    with what Hydra completes behind one."""
     asked = re.fullmatch("(install|uninstall|query)=(bash|fish|zsh)", " ".join(words))
     line = os.environ.get("COMP_LINE")
     if asked is None or (asked[1] == "query" and line is None):
@@ -280,10 +281,16 @@ def complete(words: Sequence[str]) -> None:
             f"-sc {shown}: write -sc install=SHELL or -sc uninstall=SHELL, SHELL being bash, fish,"
             " zsh"
         )
-    if (
-        line is not None
-    ):  # Hydra completes the words after the program's name; ours has the command in between
-        os.environ["COMP_LINE"] = line.replace(" run ", " ", 1)
+    if line is not None:
+        typed = line.split(" ")
+        if len(typed) == 2 and "=" not in line:
+            meant = [name for name in commands if name.startswith(typed[1])]
+            print(("\n" if asked[2] == "fish" else " ").join(meant))
+            return
+        # Hydra completes the words after the program's name; ours has the command in between.
+        if typed[1:2] and typed[1] in commands:
+            del typed[1]
+        os.environ["COMP_LINE"] = " ".join(typed)
         os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))
     _hydra().shell_completion(PluginConfigs.name, list(words))
 

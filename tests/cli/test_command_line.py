@@ -392,6 +392,20 @@ def test_hydras_own_flags_work_after_run(tmp_path, ipe_bench, monkeypatch):
     assert "measurement=gins" in ipe_bench("-sc", "query=bash")[1]
 
 
+@pytest.mark.parametrize(
+    ("line", "meant"),
+    [
+        ("ipe-bench re", "report"),
+        ("ipe-bench ", " ".join(COMMANDS)),
+        ("ipe-bench estimate measurement=ran", "measurement=ranging"),
+    ],
+)
+def test_a_shell_completes_commands_and_the_keys_behind_each(ipe_bench, monkeypatch, line, meant):
+    monkeypatch.setenv("COMP_LINE", line)
+    monkeypatch.setenv("COMP_POINT", str(len(line)))
+    assert ipe_bench("-sc", "query=bash")[1].strip() == meant
+
+
 @pytest.mark.slow
 def test_hydra_says_where_it_looks(tmp_path):
     # Which sets up logging for the whole of its process.
