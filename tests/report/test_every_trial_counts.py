@@ -84,9 +84,9 @@ def helped_by_failing(was: Analysis, now: Analysis, label: str, scale: float) ->
             if any(word in column for word in OF_SOME) or column in ("error_scale", "probability"):
                 continue
             a, b = first[column].to_numpy(dtype=float), second[column].to_numpy(dtype=float)
-            a, b = (np.nan_to_num(values, nan=np.inf, posinf=1e300) for values in (a, b))
-            falls = (b < a * (1 - 1e-9)).any()
             rises = (b > a + 1e-9).any()
+            a, b = (np.nan_to_num(values, nan=1e300, posinf=1e300) for values in (a, b))
+            falls = (b < a * (1 - 1e-9)).any()
             # The lower end of an efficiency rises where enough unusual errors are seen.
             if column.startswith(MORE_IS_BETTER) and rises and not column.endswith("_low"):
                 yield f"{name}: {column} rises"
@@ -184,7 +184,7 @@ def helped_in_figures(was: Analysis, now: Analysis, label: str, scale: float) ->
             yield "cost_against_accuracy: named the cheapest by failing"
     if "tracks" in first and "tracks" in second:
         titles = [[ax.get_title() for ax in d["tracks"].figure.axes] for d in (first, second)]
-        order = [[title.partition(":")[0] for title in some] for some in titles]
+        order = [[title.partition(": ")[2] for title in some] for some in titles]
         short = next((t for t in order[0] if label.startswith(t.rstrip("…")[:30])), None)
         if short in order[1] and order[1].index(short) < order[0].index(short):
             yield "tracks: a panel moves forward"
@@ -210,6 +210,27 @@ def test_what_is_shown_counts_every_trial(seed):
 @pytest.mark.parametrize("seed", range(100, 130))
 def test_what_is_drawn_counts_every_trial(seed):
     assert list(faults(seed, drawn=True)) == []
+
+
+@pytest.mark.slow
+def test_tracks_have_a_panel_each_with_how_many_are_kept_the_best_first():
+    """Of states that move, whose errors are of all trials."""
+    moving = next(found for found in map(results, range(20)) if "path_error" in rows_of(found))
+    analysis = moving.analysis
+    with house_style():
+        (drawing,) = (d for d in drawings(analysis, "all") if d.name == "tracks")
+    scale = analysis.tracks["error_scale"].max()
+    totals = analysis.totals[analysis.totals["error_scale"] == scale].set_index("estimator")
+    *panels, nees = drawing.figure.axes
+    assert nees.get_title() == "NEES of solved trials"
+    kept = [int(ax.get_title().partition(" of ")[0]) for ax in panels]
+    assert kept == sorted(kept, reverse=True)
+    assert sorted(kept) == sorted((totals["success"] * totals["trials"]).round().astype(int))
+    assert "over all trials" in drawing.caption
+
+
+def rows_of(found: Any) -> dict[str, Any]:
+    return next(iter(found.rows.values()))
 
 
 if __name__ == "__main__":

@@ -549,6 +549,19 @@ def test_a_page_names_the_estimator_of_each_curve_and_label(parted):
     assert "name:" not in page
 
 
+def test_the_axis_starts_before_the_linear_estimate_falls(parted):
+    """Which is the question of the paper: at scale 10 all others are still alike."""
+    view, _ = parted
+    summary = view["summary"].replace({"estimator": {"some": REFERENCE}})
+    falls = (summary["estimator"] == REFERENCE) & (summary["error_scale"] == 10)
+    summary.loc[falls, ["success", "error_median"]] = [0.2, 8.0]
+    look = looks(list(summary["estimator"].unique()))
+    whole = replace(view, frames={"summary": summary}, look=look)
+    drawing = drawn(errors, whole)["headline"]
+    assert drawing.figure.axes[0].get_xlim()[0] < 1.0
+    assert "the axis starts there" not in drawing.caption
+
+
 def test_places_of_labels_are_the_nearest_that_keep_their_distance():
     wanted = [0.5, 0.5, 0.5, 0.0, 0.98]
     found = common.spread(wanted, 0.1, 0.0, 1.0)

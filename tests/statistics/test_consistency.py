@@ -198,3 +198,13 @@ def test_1000_honest_studies_have_few_false_alarms(noise, n, m, trials):
     assert false_alarms(found) <= 0.07 + 2 * np.sqrt(0.07 * 0.93 / 1000)
     if trials >= 100 and noise is not contaminated:
         assert low.get("overconfident", 0) >= 0.9
+
+
+def test_a_variance_of_1_5_times_the_reported_is_seldom_called_consistent():
+    """Of 40 trials of four parameters, at the level that eleven estimators share."""
+    rng = np.random.default_rng(3)
+    level = 1 - 0.05 / 11
+    found = [verdict(1.5 * rng.chisquare(4, 40), 4, level) for _ in range(60)]
+    assert found.count("consistent") <= 3
+    right = [verdict(rng.chisquare(4, 100), 4, level) for _ in range(30)]
+    assert right.count("consistent") >= 25

@@ -37,7 +37,8 @@ def draw(view: View) -> Iterator[Drawing]:
     for label, ax in zip(shown, axes, strict=False):
         _draw_errors(ax, rows[rows["estimator"] == label], look[label], ends)
         kept = round(totals["success"][label] * totals["trials"][label])
-        common.title(ax, f"{label}: {kept} of {totals['trials'][label]:.0f} kept")
+        # A long name is cut at its end.
+        common.title(ax, f"{kept} of {totals['trials'][label]:.0f} kept: {label}")
     claiming = _draw_nees(axes[-1], rows, look)
     common.axis_labels(fig, "time [s]", f"error over {view.reference}")
     axes[-1].set_ylabel("NEES / n")
