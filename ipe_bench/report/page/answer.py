@@ -291,8 +291,8 @@ def with_error(value: float, error: float) -> str:
     # 0.0999 rounds to 0.10.
     rounded = float(f"{error:.1e}")
     place = math.floor(math.log10(rounded)) - 1
-    if 0 < abs(value) < _HIDDEN * error:
-        # An error that is so much larger must not hide the value.
+    if place > 0 and 0 < abs(value) < _HIDDEN * error:
+        # An error in the hundreds or more must not hide the value.
         return f"{value:.3g} ± {error:.2g}"
     return _together((value, error), " ± ", place)
 
