@@ -31,6 +31,10 @@ _FUNCTION = re.compile(r"(?P<file>.+\.py)(:(?P<name>\w*))?")
 _FORMULA = re.compile(r"[-+*/^()<>]|\bif\b")
 """A sign that a word without a key is a formula, rather than a name."""
 _FLAG = re.compile("--?[a-z][a-z-]*")
+_VALUED = re.compile(
+    "-(cd|cn|c|p|i)|--(config-dir|config-name|experimental-rerun|cfg|package|info)"
+)
+"""A flag of `run` whose value is the next word."""
 _NAMED = re.compile(r"\s*(?P<reading>[A-Za-z_]\w*)\s*=(?!=)\s*(?P<formula>.+)", re.DOTALL)
 _START = re.compile(r"measurement\.start(?:\.(?P<name>\w+)=|=\{(?P<names>.*)\}$)")
 _MODELS = ("measurement", "state_model")
@@ -64,7 +68,11 @@ def read(command: str, words: Sequence[str]) -> Short:
         UserError: a file is absent, or does not say which model, parameters or columns are meant.
     """
     refuse_blanks(words)
-    kinds = [_kind(word) for word in words]
+    before = ["", *words]
+    kinds = [
+        None if _VALUED.fullmatch(flag) else _kind(word)
+        for flag, word in zip(before, words, strict=False)
+    ]
     files = [word for word, kind in zip(words, kinds, strict=True) if kind == "readings"]
     models = [word for word, kind in zip(words, kinds, strict=True) if kind == "model"]
     if not files and not models:

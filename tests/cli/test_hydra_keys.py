@@ -222,6 +222,11 @@ def test_a_callback_of_a_folder_that_is_named_is_called_after_each_job(mine, cap
     assert [f"told {scale} ()" in out for scale in (1, 3)] == [True, True]
 
 
+def test_a_folder_within_a_folder_is_no_formula(capsys):
+    Path("my/conf").mkdir(parents=True)
+    assert main(["run", "-cd", "my/conf", *SMALL, "--dry-run"]) == 0
+
+
 def test_a_primary_config_of_ones_own(capsys):
     OWN.mkdir()
     (OWN / "study.yaml").write_text("defaults: [config, _self_]\ntrials: 7\n")
