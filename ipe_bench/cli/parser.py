@@ -17,7 +17,7 @@ _ABOUT = """\
 ipe-bench: which estimator to trust with nonlinear measurements
 
   ipe-bench estimate oxygen.py oxygen.csv         your function, your readings
-  ipe-bench run oxygen.py oxygen.csv              which estimator to take for them
+  ipe-bench run oxygen.py oxygen.csv              which estimator suits them
   ipe-bench run +experiment=paper                 the paper's experiment
   ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[ekf]"
   ipe-bench run -m error_scale=1,10,100 seed=1,2  a sweep, by Hydra
@@ -53,10 +53,10 @@ COMMANDS: dict[str, tuple[str, str, str, Arguments] | None] = {
         "simulate, estimate, store and report",
         "0 done; 1 done, but something failed",
         """
-  ipe-bench run oxygen.py oxygen.csv              which estimator to take for data
+  ipe-bench run oxygen.py oxygen.csv              which estimator suits data
                                                   like yours: your function, a
                                                   formula in quotes, or the YAML
-                                                  file of a state model with a log
+                                                  file of states, with a log
   ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[ekf]"
   ipe-bench run +experiment=paper                 an experiment
   ipe-bench run -m error_scale=1,10,100 seed=1,2  a job for each combination

@@ -180,8 +180,8 @@ def _parameters(name: str, design: Design) -> Table:
         columns.append(words("strongest", strongest))
     s = seen.singular_values[0]
     notes = [
-        "bound: smallest standard deviation of an unbiased estimator if the true values are those"
-        f" of {_where(design)}. Correlations of the errors there: multiple correlation with all"
+        "bound: smallest standard deviation of an unbiased estimator at the true values of"
+        f" {_where(design)}. Correlations of the errors there: multiple correlation with all"
         " others, and the strongest with one other.",
         f"Singular values of the whitened Jacobian, per parameter's size: {short(s[0])} to"
         f" {short(s[-1])}.",

@@ -12,17 +12,18 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.questions.question import NAMES, Answered, Asked, Question
 
 _MORE = """
-  ipe-bench design oxygen.py oxygen.csv          with the noise of your readings,
+  ipe-bench design oxygen.py oxygen.csv          with your readings' noise,
                                                  about your estimate
   ipe-bench design measurement=ranging error_scale=10
   ipe-bench design measurement=gins by=time          other times, equal cases
   ipe-bench design measurement=gins truth_measurement=gins_tilted
 
-The analysis uses the model's Jacobians at its start, and at true parameters drawn
-from the prior, without noise. Unmodelled errors come from truth_measurement=, or
-from every option of measurement= that adds errors to the model.
+The analysis uses the model's Jacobians at its start, and at true parameters
+drawn from the prior, without noise. Unmodelled errors come from
+truth_measurement=, or from every option of measurement= that adds errors to the
+model.
 
-at=FOLDER           everything at the estimate that `ipe-bench estimate` wrote there
+at=FOLDER           all at the estimate that `ipe-bench estimate` wrote there
 by=COLUMN           choose by this column of the readings; by=[A,B] by several
 readings=NUMBER     largest number of readings (today's)
 criterion=D         minimise the mean squared bound (A, the default) or the

@@ -85,8 +85,7 @@ def draw_bounds(
     ax.set_xlabel("bound, in the unit of each row")
     common.legend(fig, [ax])
     caption = (
-        "Cramér-Rao bound of each parameter's standard deviation, if the true values are those of"
-        f" {where}."
+        f"Cramér-Rao bound of each parameter's standard deviation, at the true values of {where}."
     )
     if not known.all():
         caption += " Without a hollow mark: today's readings leave the parameter open."

@@ -208,7 +208,7 @@ def _meaning(own: Own) -> str:
             " factor: by which the bars would be right. All shares are approximate."
         )
     return (
-        "finds: the readings of the answer lie closer to those of the best fit than noise puts the"
+        "finds: the answer's readings lie closer to the best fit's than noise puts the"
         " best fit to the truth. bars: 95 % intervals as `estimate` prints them, of the worst"
         " parameter. factor: by which they would be right. cost: median evaluations of the model."
         " All shares are approximate: the truth is your estimate, which is uncertain too."

@@ -35,7 +35,7 @@ def own_log(
     """
     track = LogTracks.of(log, "auto", AutoTracker())
     if not track.passes:
-        why = track.message or "its innovations are not those of the model"
+        why = track.message or "its innovations do not fit the model"
         raise UserError(
             f"the model does not fit the log ({why}), so logs simulated from it would not be like"
             " yours; see `ipe-bench estimate` with the same words, and mend the model first"
