@@ -9,17 +9,15 @@ from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.engine.chains import from_before, lower
 from ipe_bench.states.algebra import upper_solve
 
-_PRECISE = 1e8
-"""Variance of what is read, in parts of that of its reading, above which a covariance loses half of
-its digits."""
 BEYOND = 1e25
-"""The same, above which round-off counts beside what readings leave, however it is kept."""
+"""Variance of what is read, in parts of that of its reading, above which round-off counts beside
+what readings leave."""
 
 
-def precise(H: Array, P: Array, R: Array, most: float = _PRECISE) -> Mask:
+def precise(H: Array, P: Array, R: Array, most: float) -> Mask:
     """Tells in which trials readings (trials, K, m) of slopes H (trials, K, m, n) and variances R
-    are so precise beside the variances P (trials, K, n) before them that covariances have to be
-    kept by roots."""
+    are so precise beside the variances P (trials, K, n) before them that what is read has more than
+    `most` times the variance of its reading."""
     # Not the variance of what is read, which may be small by cancellation of large terms.
     deviation = np.sqrt(np.maximum(P, 0.0))
     largest = np.einsum("tkmi,tki->tkm", np.abs(H), deviation)
