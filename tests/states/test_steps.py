@@ -214,3 +214,25 @@ def test_a_negative_weight_that_leaves_no_covariance_has_no_track():
     with np.errstate(invalid="ignore"):
         tracks = filtered(square, z, Unscented(kappa=-0.5))
     assert not np.isfinite(tracks.covariance).all()
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: type(rule).__name__)
+def test_smoothers_are_those_of_rauch_tung_and_striebel(rule):
+    """By gains P A' (P-)^-1 behind the filter's own track."""
+    model = Pendulum(count=12, spread=0.5)
+    z = model.draw(0, 3).z
+    z[1, 4:6] = np.nan
+    tracks = Filter(rule).track(model, z)
+    smooth = Smoother(Filter(rule)).track(model, z)
+    x = tracks.mean[:, -1]
+    P = tracks.covariance[:, -1]
+    for k in range(model.epochs - 1, 0, -1):
+        before = Normal(tracks.mean[:, k - 1], tracks.covariance[:, k - 1])
+        A, b, W = rule.linearise(lambda x, k=k: model.transition(x, k), *before)
+        moved = np.einsum("tij,tj->ti", A, before.mean) + b
+        predicted = A @ before.covariance @ A.mT + W + model.Q(k)
+        gain = before.covariance @ A.mT @ np.linalg.inv(predicted)
+        x = before.mean + np.einsum("tij,tj->ti", gain, x - moved)
+        P = before.covariance + gain @ (P - predicted) @ gain.mT
+        np.testing.assert_allclose(smooth.mean[:, k - 1], x, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(smooth.covariance[:, k - 1], P, rtol=1e-7, atol=1e-11)
