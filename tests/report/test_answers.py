@@ -248,8 +248,9 @@ def test_the_only_change_is_named_by_the_second_estimator_and_numbers_are_never_
     only = {"scenario": "gins, error scale 100", "first": "a", "second": "b", "trials": 9}
     assert _names([only | {"quantity": kind} for kind in ("success", "cost")]) == ["b", "b"]
     assert text("newton, gins, quantization, error scale 1000") == (
-        "newton, gins, quantization, error scale …"
+        "newton, gins, quanti…ion, error scale 1000"
     )
+    assert text(f"{'n' * 21}1234567890{'m' * 20}") == f"{'n' * 21}…{'m' * 20}"
 
 
 def test_each_change_is_worded_beside_its_margin_and_filled_if_it_is_beyond(tmp_path):

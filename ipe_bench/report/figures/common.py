@@ -140,8 +140,14 @@ def left_out(scales: Sequence[float], panels: Sequence[Any]) -> str:
 
 
 def text(value: Any) -> str:
-    """Returns a name for use in a figure: never read as mathematics, never longer than a line."""
-    words = _cut(str(value), 16 if print_width() else 42)
+    """Returns a name for use in a figure: never read as mathematics, never longer than a line. Of a
+    longer one the beginning and the end stand, where options tell names apart."""
+    words = str(value)
+    most = 16 if print_width() else 42
+    if len(words) > most:
+        tail = words[-(most // 2) :].lstrip(_OF_NUMBERS)
+        words = f"{_cut(words, most - len(tail))}{tail}"
+    words = words.replace(r"\$", "$").replace("$", r"\$")
     # A leading underscore would hide the name from legends.
     return f"\u200b{words}" if words.startswith("_") else words
 
