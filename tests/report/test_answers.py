@@ -357,19 +357,21 @@ def test_a_page_says_what_was_tested_only_where_something_was(walked):
         assert said.endswith("Smoothers, which use later readings: rts.")
 
 
-def test_a_filter_predicts_readings_from_those_before_and_a_smoother_none(walked):
+def test_a_filter_predicts_readings_from_those_before_and_a_smoother_the_missing_one(walked):
     found, _ = walked
     model, table = found.log.model, found.table()
     kf = table[table["tracker"] == "kf"]
     moved = model.transition(found["kf"].mean[:-1], 1)
-    there = kf["reading_predicted"].notna().to_numpy()
+    there = kf["reading_reading"].notna().to_numpy()
     assert not there[11]
     assert there.sum() == 59
     predicted = kf["reading_predicted"].to_numpy()[1:]
-    np.testing.assert_allclose(predicted[there[1:]], moved[there[1:], 0], rtol=1e-12)
+    np.testing.assert_allclose(predicted, moved[:, 0], rtol=1e-12)
     off = (kf["reading_reading"] - kf["reading_predicted"]) / kf["reading_predicted_deviation"]
     np.testing.assert_allclose(off[there] ** 2, kf["nis"][there], rtol=1e-9)
-    assert table.loc[table["tracker"] == "rts", "reading_predicted"].isna().all()
+    smoothed = table.loc[table["tracker"] == "rts", "reading_predicted"].to_numpy()
+    assert np.flatnonzero(np.isfinite(smoothed)).tolist() == [11]
+    assert smoothed[11] == pytest.approx(found["rts"].mean[11, 0], rel=1e-12)
 
 
 def test_what_is_beyond_the_axis_of_a_track_is_marked_there():
