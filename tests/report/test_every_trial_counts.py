@@ -87,8 +87,9 @@ def helped_by_failing(was: Analysis, now: Analysis, label: str, scale: float) ->
             rises = (b > a + 1e-9).any()
             a, b = (np.nan_to_num(values, nan=1e300, posinf=1e300) for values in (a, b))
             falls = (b < a * (1 - 1e-9)).any()
-            # The lower end of an efficiency rises where enough unusual errors are seen.
-            if column.startswith(MORE_IS_BETTER) and rises and not column.endswith("_low"):
+            # Ends of an efficiency's interval rise where it widens, or unusual errors are known.
+            is_end = column.startswith("efficiency_capped_")
+            if column.startswith(MORE_IS_BETTER) and rises and not is_end:
                 yield f"{name}: {column} rises"
             is_error = any(word in column for word in LESS_IS_BETTER) or column == "distance"
             if is_error and falls and not column.endswith(OTHER_MEANINGS):
