@@ -284,7 +284,8 @@ class Measurement(Component, ABC):
             return
         raise UserError(
             f"measurement={self.name}: `analytic` is set, and complex steps do not find the slopes"
-            " of simulate, as behind np.abs or np.maximum; leave `analytic` out"
+            " of simulate, as behind np.abs or np.maximum; write np.where(u.real < 0, -u, u) for"
+            " np.abs(u), or leave `analytic` out"
         )
 
     @cached_property

@@ -630,7 +630,7 @@ CHANGES = {
         "a smoother forgets the noise of a transition",
         "lower(beside(product(X, S), Y))",
         "lower(product(X, S))",
-        "test_steps.py",
+        "test_recorded_steps.py",
     ),
     "resampled-last": Change(
         "states",

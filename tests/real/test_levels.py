@@ -360,7 +360,7 @@ FLAT = replace(DECAY, expression="second*(a + k*t) + 0*l")
             BY,
             np.s_[32:],
             np.nan,
-            "the 2 readings of 1 are too few to determine sigma beside 2 parameters",
+            "the 2 readings of 1 are too few to determine sigma in addition to 2 parameters",
         ),
         (FLAT, BY, np.s_[:30], 0.0, "the level of 0 cannot be estimated from residuals of zero"),
         (

@@ -202,11 +202,11 @@ REFUSED = {
     ),
     "a quote left open": (
         text(*GOOD[:4], '3.5,"0.001,2.0', *GOOD[5:]),
-        r"row \d: is not a readable CSV file",
+        r"row \d: cannot be read as CSV .*; fix the quotes",
     ),
     "a quote within": (
         text(*GOOD[:4], '3.5,"0."001,2.0', *GOOD[5:]),
-        r"row 5: is not a readable CSV file",
+        r"row 5: cannot be read as CSV .*; fix the quotes",
     ),
     "latin-1": (
         text("t,y [µV],sigma", *GOOD[1:]).decode().encode("latin-1"),

@@ -110,7 +110,7 @@ def test_a_line_search_takes_no_step_that_decreases_nothing():
         size = np.sqrt(np.abs(at))
         return (np.sign(at) * size + (a - at) / np.maximum(2 * size, 1e-300),)
 
-    model = Written(signed_root, 1, 1)
+    model = Written(signed_root, 1, 1, first=0.5)
     start = np.array([[0.5], [-3.0]])
     assert (
         roots_of(model, Newton(), start, max_iterations=50)[0].status == Status.MAX_ITERATIONS

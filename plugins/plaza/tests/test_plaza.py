@@ -59,7 +59,7 @@ def test_a_drive_round_a_circle_ends_where_it_began():
             9,
             0,
             "3151.5",
-            "row 9, column time [s]: is not after the time of the row before; give rows in the"
+            "row 9, column time [s]: is before the time of the row above; give rows in the"
             " order of",
         ),
         (
