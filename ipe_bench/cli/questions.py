@@ -92,7 +92,10 @@ def _asked(name: str, arguments: Sequence[str], row: Row, files: Sequence[str]) 
         say(*lines)
         if found.words.standard_baselines:
             spec = spec.suited()
-    return Asked(found.measurement, spec.scenario, spec.estimators, trials, found.folder)
+    about_estimate = bool(files) and row.at_estimate
+    return Asked(
+        found.measurement, spec.scenario, spec.estimators, trials, found.folder, about_estimate
+    )
 
 
 def _shown(found: Answered) -> int:

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from functools import cached_property
 from pathlib import Path
 
 from ipe_bench.basics.errors import UserError, did_you_mean, place_of, unknown
+from ipe_bench.basics.files import fault_of
 from ipe_bench.cli import refuse_blanks
 from ipe_bench.cli import words as w
 from ipe_bench.cli.spec import KEYS
@@ -111,16 +113,22 @@ def _typed_files(word: str) -> list[str]:
     return names
 
 
-def _names_reading(word: str, files: Sequence[str]) -> bool:
-    """Tells if a word is a formula that names its reading, as in y = a*t + b."""
+def _reading_named(word: str) -> str:
+    """Returns the reading that a formula names, as in y = a*t + b; empty if the word is none."""
     named = _NAMED.fullmatch(word)
     if named is None or named["reading"] in {*KEYS, *plugins.groups()}:
-        return False
-    if not _FORMULA.search(named["formula"]):
+        return ""
+    return named["reading"] if _FORMULA.search(named["formula"]) else ""
+
+
+def _names_reading(word: str, files: Sequence[str]) -> bool:
+    """Tells if a word is a formula that names its reading among the columns."""
+    reading = _reading_named(word)
+    if not reading:
         return False
     for file in files:
         _require_file(file)
-    return named["reading"] in _columns(read_tables([Path(files[0])])[0])
+    return reading in _columns(read_tables([Path(files[0])])[0])
 
 
 def _require_pair(
@@ -140,6 +148,7 @@ def _require_pair(
         raise UserError(f"{models[0]}: is a model without readings; add their file: {example}")
     if files and not models and keys.isdisjoint(_MODELS):
         _refuse_bare_names(others)
+        _refuse_no_model(files[0], others)
         raise UserError(
             f"{files[0]}: holds readings, and no model is given; write a function's file, a formula"
             f' in quotes or a YAML file before it: ipe-bench {command} "a*exp(-b*t)+c" {files[0]},'
@@ -155,18 +164,42 @@ def _refuse_bare_names(words: Sequence[str]) -> None:
                 raise UserError(f"{word}: is not KEY=VALUE; write {group}={word}")
 
 
+def _refuse_no_model(file: str, words: Sequence[str]) -> None:
+    """Refuses what stands in a model's place: a formula of another column, or another word."""
+    for word in words:
+        reading = _reading_named(word)
+        if reading:
+            columns = ", ".join(_columns(read_tables([Path(file)])[0]))
+            raise UserError(
+                f"{word}: {file} has no column {reading}; its columns are {columns}: name one of"
+                " them before the ="
+            )
+    flags = [word for word in words if word.startswith("-")]
+    bare = [word for word in words if "=" not in word and not word.startswith("~")]
+    if bare and not flags:
+        what = "is a folder" if Path(bare[0]).is_dir() else "is no model"
+        raise UserError(
+            f"{bare[0]}: {what}; write a function's file, a formula in quotes or a YAML file in its"
+            " place"
+        )
+
+
 def _shown(model: str) -> str:
     return f'"{model}"' if _FORMULA.search(model) and not _FUNCTION.fullmatch(model) else model
 
 
 def _require_file(name: str) -> None:
-    if Path(name).is_file() or Path(name).parent.as_posix().startswith("ipe_bench/real/samples"):
-        return
     path = Path(name)
+    fault = fault_of(path)
+    if not fault or path.parent.as_posix().startswith("ipe_bench/real/samples"):
+        return
+    if os.path.lexists(path):
+        raise UserError(f"{name}: {fault}")
     siblings = []
     if path.parent.is_dir():
-        siblings = [one.name for one in path.parent.iterdir() if one.suffix == path.suffix]
-    raise UserError(f"{name}: there is no such file here{did_you_mean(path.name, siblings)}")
+        alike = [one for one in path.parent.iterdir() if one.suffix == path.suffix]
+        siblings = [one.name for one in alike if one.is_file()]
+    raise UserError(f"{name}: {fault} here{did_you_mean(path.name, siblings)}")
 
 
 def _columns(table: TextTable) -> list[str]:
@@ -289,17 +322,21 @@ class _Reader:
         reading = self._reading(what, wanted, ["reading"])
         words = ["measurement=function", f"measurement.of={module}:{chosen.name}"]
         words += _reading_word(reading, ("reading",))
-        model = f"Model: {what} of {file}{_values(starts)}."
+        shown = {one.arg: {**starts, **typed}.get(one.arg, "") for one in arguments}
+        shown = {name: value for name, value in shown.items() if value}
+        model = f"Model: {what} of {file}{_values(shown)}."
         return self._short(words, [model, self._told(wanted, reading), self._noise()])
 
     @property
-    def _started(self) -> set[str]:
-        """Names whose start is typed."""
-        found = set()
+    def _started(self) -> dict[str, str]:
+        """Starts that are typed, by name."""
+        found = {}
         for word in self.others:
             start = _START.match(word)
-            if start:
-                found |= {start["name"]} if start["name"] else set(re.findall(r"(\w+)\s*:", word))
+            if start and start["name"]:
+                found[start["name"]] = word.partition("=")[2]
+            elif start:
+                found |= dict(re.findall(r"(\w+)\s*:\s*([^,\s]*)", start["names"]))
         return found
 
     def _told(self, columns: Sequence[str], reading: str) -> str:
@@ -327,9 +364,10 @@ class _Reader:
         words = ["measurement=formula", f"measurement.expression={w.quoted(formula)}"]
         words += [f"measurement.start.{name}=1" for name in starts]
         words += _reading_word(reading, ("y", "reading"))
-        start = f"start 1 for {enumerate_few(starts)}; " if starts else ""
-        remedy = f"{start}measurement.start.{(starts or names)[0]}=X sets another"
-        model = f"Model: {formula}; {remedy}."
+        start = f"; start 1 for {enumerate_few(starts)}" if starts else ""
+        start += _values({name: typed[name] for name in names if name in typed})
+        remedy = f"measurement.start.{(starts or names)[0]}=X sets another"
+        model = f"Model: {formula}{start}; {remedy}."
         return self._short(words, [model, self._told(columns, reading), self._noise()])
 
     # Equations

@@ -206,7 +206,13 @@ class Measurement(Component, ABC):
 
     def hindrance(self, x: Array) -> str:
         """Says why the readings at x (n,) cannot be computed; empty if they can."""
-        return "" if np.isfinite(self.simulate(x[None])).all() else "the readings are not finite"
+        finite = np.isfinite(self.simulate(x[None])[0])
+        if finite.all():
+            return ""
+        first = int(np.argmin(finite))
+        columns = labels(self).items()
+        where = ", ".join(f"{name}={values[first]}" for name, values in columns)
+        return f"the model's readings are not finite, first at {where}"
 
     def remarks(self, x: Array) -> tuple[str, ...]:
         """Returns remarks for users on this model at x (n,), such as its integration method."""

@@ -34,6 +34,8 @@ class Asked:
     folder: Callable[[str, Any, Sequence[str]], AbstractContextManager[Path]]
     """Reserves the folder of an answer, by the name of its page, what identifies the command, and
     its further files."""
+    about_estimate: bool = False
+    """Whether the model starts at the estimate from a user's own readings."""
 
 
 @dataclass(frozen=True)

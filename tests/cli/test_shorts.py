@@ -39,7 +39,22 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     FILES["falling.csv"] = "\n".join(["t,reading", *rows]) + "\n"
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
+    (tmp_path / "folder.csv").mkdir()
+    (tmp_path / "folder.yaml").mkdir()
     return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["a*t+b", "line.csv"], "start 1 for a, b; measurement.start.a=X"),
+        (["a*t+b", "line.csv", "measurement.start.b=-5"], "start 1 for a; start b = -5; meas"),
+        (["a*t+b", "line.csv", "measurement.start={a: 2, b: 3}"], "; start a = 2, b = 3; meas"),
+        (["falling.py", "falling.csv", "measurement.start.v=-2"], "; start h = 10.0, v = -2."),
+    ],
+)
+def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: str) -> None:
+    assert said in shorts.read("estimate", words).assumed[0]
 
 
 @pytest.mark.parametrize(
@@ -105,12 +120,20 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
         (["t+y", "line.csv"], "no column is left for the readings"),
         (["red.yaml", "log.csv"], "is no model: it has neither next:"),
         (["/usr/falling.py", "falling.csv"], "there is no such file"),
+        (["a+b*t", "folder.csv"], "folder.csv: is a folder; name a file"),
+        (["folder.yaml", "line.csv"], "folder.yaml: is a folder; name a file"),
+        (["a+b*t", "older.csv"], "older.csv: there is no such file here"),
+        ([".", "line.csv"], ".: is a folder; write a function's file"),
+        (["line", "line.csv"], "line: is no model; write a function's file"),
+        (["q = a + b*t", "line.csv"], "line.csv has no column q; its columns are t, y"),
+        (["q=a+b*t", "volt.csv"], "volt.csv has no column q; its columns are t, volt"),
     ],
 )
 def test_a_mistake_is_one_line(words: list[str], said: str) -> None:
     with pytest.raises(UserError) as error:
         shorts.read("estimate", words)
     assert said in str(error.value)
+    assert "did you mean folder" not in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -155,6 +178,9 @@ def test_the_bounds_of_a_design_are_the_standard_errors_of_the_estimate(ipe_benc
     rows = [line.split() for line in out.splitlines() if line.split()[:1] in (["a"], ["b"])]
     bounds = [float(row[1]) for row in rows]
     np.testing.assert_allclose(bounds, np.sqrt(np.diag(C)), rtol=0.01)
+    assert "at the true values of the estimate" in out
+    assert "today's at the estimate" in out
+    assert "the start" not in out
 
 
 @pytest.mark.slow

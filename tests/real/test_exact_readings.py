@@ -7,6 +7,7 @@ import pytest
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula
 from ipe_bench.report.page.answer import with_error
 
@@ -50,10 +51,19 @@ def test_readings_that_are_exact_but_for_one_are_not():
     assert np.flatnonzero(one.outliers).tolist() == [7]
 
 
-def test_as_many_readings_as_parameters_are_no_exact_data():
+@pytest.mark.parametrize("z", [(1.0, 3.0), (1.0, 3.0, np.nan, np.nan), (np.nan, 2.0)])
+def test_no_noise_is_estimated_from_as_many_readings_as_parameters(z):
+    model = Formula("a*x+b", {"a": 1.0, "b": 1.0}, {"x": X[: len(z)]})
+    said = f"{np.isfinite(z).sum()} for 2 parameters leave no degree of freedom"
+    with pytest.raises(UserError, match=said):
+        ib.estimate(model, np.array(z), LM)
+
+
+def test_as_many_readings_as_parameters_have_an_answer_with_noise_that_is_stated():
     model = Formula("a*x+b", {"a": 1.0, "b": 1.0}, {"x": (0.0, 1.0)})
-    (one,) = ib.estimate(model, np.array([1.0, 3.0]), LM)
-    assert not one.exact
+    (one,) = ib.estimate(model, np.array([1.0, 3.0]), LM, noise=ib.noise.Gaussian(0.1))
+    assert one.x == pytest.approx([2, 1])
+    assert one.standard_errors == pytest.approx([0.1 * 2**0.5, 0.1])
 
 
 @pytest.mark.parametrize(
@@ -69,3 +79,9 @@ def test_as_many_readings_as_parameters_are_no_exact_data():
 )
 def test_an_estimate_is_never_hidden_by_its_error(value, error, said):
     assert with_error(value, error) == said
+
+
+def test_a_model_that_cannot_be_computed_names_its_first_reading():
+    model = Formula("a+b*log(x)", {"a": 1.0, "b": 1.0}, {"x": (2.0, -1.0, -2.0, 1.0)})
+    with pytest.raises(UserError, match=r"the model's readings are .*first at row=2, x=-1\.0$"):
+        ib.estimate(model, np.array([1.0, 2.0, 3.0, 4.0]), LM)

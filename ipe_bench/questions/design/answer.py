@@ -204,7 +204,8 @@ def _parameters(name: str, design: Design) -> Table:
 
 
 def _where(design: Design) -> str:
-    return "the start" if design.at is None else "the estimate"
+    at_start = design.at is None and not design.about_estimate
+    return "the start" if at_start else "the estimate"
 
 
 def _over_the_prior(design: Design) -> Iterator[Column]:

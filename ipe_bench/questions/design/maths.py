@@ -141,6 +141,8 @@ class Design:
     open."""
     lost: int = 0
     """The number of truths that have no finite readings, over which nothing is averaged."""
+    about_estimate: bool = False
+    """Whether the model starts at the estimate from a user's own readings."""
 
     def measurement(self, choice: Choice) -> Measurement:
         """Returns the model that takes these readings and no others."""
