@@ -93,7 +93,8 @@ class Question:
                 f"measurement={model.name}: cannot be computed where estimation starts: {hindrance}"
             )
         error_scale = 1.0 if self.error_scale is None else self.error_scale
-        noise = self._noise()
+        scenario = Scenario(model, self._noise(), prior, error_scale)
+        noise = scenario.noise
         there = int(np.isfinite(self.found.z).sum())
         # Several levels say themselves which of them has too few readings.
         if noise.estimated and there <= model.n and noise.levels_of(model) is None:
@@ -101,7 +102,7 @@ class Question:
                 f"readings: {there} for {model.n} parameters leave no degree of freedom to estimate"
                 " the noise; state noise=gaussian noise.deviation=X"
             )
-        return Scenario(model, noise, prior, error_scale)
+        return scenario
 
     @cached_property
     def problem(self) -> Problem:

@@ -85,3 +85,27 @@ def test_a_model_that_cannot_be_computed_names_its_first_reading():
     model = Formula("a+b*log(x)", {"a": 1.0, "b": 1.0}, {"x": (2.0, -1.0, -2.0, 1.0)})
     with pytest.raises(UserError, match=r"the model's readings are .*first at row=2, x=-1\.0$"):
         ib.estimate(model, np.array([1.0, 2.0, 3.0, 4.0]), LM)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize(
+    "expression", ["a*(1-exp(-b*(x+1)))", "a*tanh(b*(x+1))", "a-exp(-b*(x+1)^2)"]
+)
+def test_a_parameter_that_may_go_to_infinity_is_said_to(expression, noise):
+    """Each is a, but for round-off, with every b above 40: equal readings do not tell it."""
+    z = 5 + noise * np.cos(7 * np.array(X))
+    answer = answered(expression, {"a": 4.0, "b": 1.0}, z)
+    (one,) = answer
+    assert one.x[0] == pytest.approx(5, abs=0.01)
+    assert one.undetermined == one.endless == ("b",)
+    assert "The readings do not determine b (at lm)" in str(answer)
+    assert "lm: b may go to infinity" in str(answer)
+    assert answer.finding() == "the readings do not determine b"
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_parameter_that_readings_tell_may_not_go_to_infinity(noise):
+    z = 1e6 * (1 - np.exp(-3 * (np.array(X) + 1))) + noise * np.cos(7 * np.array(X))
+    (one,) = answered("a*(1-exp(-b*(x+1)))", {"a": 1e6, "b": 1.0}, z)
+    assert one.x == pytest.approx([1e6, 3], rel=1e-6)
+    assert one.undetermined == one.endless == ()
