@@ -120,7 +120,8 @@ def read_yaml_file(path: Path, key: str) -> Any:
             f"{key}: cannot be read ({error.__class__.__name__}); name a YAML file"
         ) from None
     except yaml.YAMLError as error:
-        raise UserError(f"{key}: {explain_yaml(error, path)}") from None
+        told = explain_yaml(error, path)
+        raise UserError(told if key == str(path) else f"{key}: {told}") from None
 
 
 def explain_yaml(error: Any, path: Path | None = None) -> str:

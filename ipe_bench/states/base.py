@@ -501,7 +501,7 @@ def _name_faults(model: StateModel) -> Iterator[str]:
                 yield f"two of its {what} have the name {name}; rename one"
     for name in model.scored:
         if name not in names:
-            yield f"scored: {unknown(name, names, 'state')}"
+            yield f"scored: {name}: {unknown(name, names, 'state')}"
 
 
 def _time_faults(model: StateModel) -> Iterator[str]:

@@ -376,7 +376,7 @@ def _check_group(key: str, formulas: Mapping[str, Arithmetic], names: set[str]) 
     for label, formula in formulas.items():
         for name in formula.names:
             if name not in names:
-                raise UserError(f"{key}.{label}: {unknown(name, names, 'name')}")
+                raise UserError(f"{key}.{label}: {name}: {unknown(name, names, 'name')}")
 
 
 def _check_noise(model: Formulas) -> None:

@@ -261,7 +261,7 @@ OF_STATES = [
     ),
     (
         ["state_model=growth", "state_model.next.state=x"],
-        "state_model.next.state: there is no such name",
+        "state_model.next.state: x: there is no such name",
     ),
     (
         ["+experiment=polynomial", "state_model=growth"],

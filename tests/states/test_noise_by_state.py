@@ -366,7 +366,7 @@ def test_what_takes_fixed_noise_refuses_before_any_work(tmp_path):
         ),
         (
             {"deviation": {"range": "0.05 + c*x", "bearing": 0.02}},
-            r"deviation\.range: there is no such name",
+            r"deviation\.range: c: there is no such name",
         ),
         (
             {"deviation": {"range": -1, "bearing": 0.02}},

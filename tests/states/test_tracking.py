@@ -433,7 +433,7 @@ WALK = {
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"next": {"x": "x + y", "v": "v + w"}}, r"next\.x: there is no such name"),
+        ({"next": {"x": "x + y", "v": "v + w"}}, r"next\.x: y: there is no such name"),
         ({"next": {"x": "x +", "v": "v"}}, r"next\.x: 'x \+' is not a formula"),
         ({"next": {"x": "x", "v": "v + w*w"}}, "next: depends on w by more than a factor"),
         (
@@ -445,7 +445,7 @@ WALK = {
             {"constants": {"h": 1.0, "x": 2.0}},
             r"next\.x: two of states, noise, constants, inputs, k and t have",
         ),
-        ({"readings": {"z": "x + w"}}, r"readings\.z: there is no such name"),
+        ({"readings": {"z": "x + w"}}, r"readings\.z: w: there is no such name"),
         ({"spread": {"x": 1.0}}, r"spread\.v: is not given"),
         (
             {"readings": {"z": "x", "y": "v"}, "deviation": {"z": "1 + x**2"}},

@@ -27,7 +27,7 @@ _TOO_SMALL = 0.88
 estimate, this verdict is true of fresh data sets in nine of ten cases."""
 _TOO_LARGE = 0.75
 """Share of their width that would do, below which they are said to be too large."""
-_CHEAPER = 10.0
+_CHEAPER = 5.0
 """Factor of the cost from which it is named."""
 
 
@@ -211,7 +211,8 @@ def _meaning(own: Own) -> str:
         "finds: the answer's readings lie closer to the best fit's than noise puts the"
         " best fit to the truth. bars: 95 % intervals as `estimate` prints them, of the worst"
         " parameter. factor: by which they would be right. cost: median evaluations of the model."
-        " All shares are approximate: the truth is your estimate, which is uncertain too."
+        f" Shares are of all {own.trials} data sets, whether the best fit was found or not, and"
+        " approximate: the truth is your estimate, which is uncertain too."
     )
 
 

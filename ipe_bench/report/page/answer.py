@@ -377,10 +377,10 @@ def _notes_on_fit(one: Fit) -> Iterator[str]:
         yield f"{SEARCH}: Levenberg-Marquardt steps from the best of further starts."
     if one.beaten_by:
         yield (f"{one.label}: {one.beaten_by} found a significantly better fit; rejected.")
-    for name in one.endless:
+    for name, value in one.endless.items():
         yield (
-            f"{one.label}: {name} may go to infinity: with every {name} beyond"
-            f" {one.values[name]:.4g} the readings of the model are the same."
+            f"{one.label}: {name} may go to infinity: with every {name} beyond {value:.4g} the"
+            " readings of the model are the same."
         )
     if one.lower_at:
         yield f"{one.label}: {one.lower_at} found a lower minimum; use that answer."
