@@ -24,6 +24,12 @@ from ipe_bench.real.readings import SIGMA, Readings, open_together
 from ipe_bench.real.search import examined
 from ipe_bench.trials.scenario import Scenario
 
+_FAR = 10.0
+"""Times by which readings are farther from those of the start than any of both reaches, from which
+on another start is suggested."""
+_ALIKE = 1e-6
+"""The share by which slopes differ that shift all readings alike."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Question:
@@ -158,6 +164,29 @@ class Question:
                 " out, or set noise=unknown to take the column for relative weights"
             )
         return Gaussian(deviations)
+
+
+def nearer_starts(model: Measurement, z: Array) -> dict[str, float]:
+    """Finds starts, each of one parameter that shifts all readings alike, from which the model's
+    readings are of the size of z (m,); none unless those of the start are far from it."""
+    if not hasattr(getattr(model, "whole", model), "start"):
+        return {}
+    there = z[np.isfinite(z)]
+    x = model.nominal[None]
+    with np.errstate(all="ignore"):
+        h = model.simulate(x)[0]
+        J = model.jacobian(x)[0]
+    gap = float(np.median(there)) - float(np.median(h))
+    if not abs(gap) > _FAR * max(np.abs(h).max(), np.ptp(there)):
+        return {}
+    found = {}
+    for k, p in enumerate(model.physical_parameters):
+        slopes = J[:, k]
+        if slopes[0] and np.ptp(slopes) <= _ALIKE * abs(slopes[0]):
+            nearer = x.copy()
+            nearer[0, k] += gap / slopes[0]
+            found[p.name] = float(model.physical(nearer)[0, k])
+    return found
 
 
 def prior_stated(prior: Prior, model: Measurement) -> Prior:

@@ -17,6 +17,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators import Estimates, Estimator
 from ipe_bench.measurements import Formula
 from ipe_bench.noise import Gaussian, Unknown
+from ipe_bench.real.estimation import nearer_starts
 from ipe_bench.real.examination import Examination
 from ipe_bench.report.page.answer import estimate_content
 from ipe_bench.solvers import Auto
@@ -65,6 +66,24 @@ def test_parameters_that_the_readings_do_not_tell_apart_are_named():
     answer = ib.estimate(sure, z, {"lm": LevenbergMarquardt()}, noise=Gaussian(0.01))
     assert answer["lm"].undetermined == ()
     assert "do not determine" not in str(answer)
+
+
+@pytest.mark.parametrize(("offset", "spread"), [(1e6, 1.0), (-4e4, 1.0), (0.0, 1.0), (1e6, 1e6)])
+def test_a_start_far_from_the_readings_is_named_with_a_nearer_one(offset, spread):
+    """Only a shift of all readings alike can be far from them: c, but neither a nor w."""
+    z = offset + spread * np.sin(1.3 * T)
+    model = Formula("a*sin(w*t)+2*c", {"a": 1.0, "w": 1.0, "c": 1.0}, {"t": T.tolist()})
+    found = nearer_starts(model, z)
+    if abs(offset) <= spread:
+        assert found == {}
+        return
+    assert list(found) == ["c"]
+    assert 2 * found["c"] == pytest.approx(offset, abs=10)
+    stating = {"one": Stating((1.0, 1.0, 1.0))}
+    lost = ib.estimate(model, z + 0.1 * T**2, stating, noise=Gaussian(0.01))
+    assert f"try measurement.start.c={found['c']:.2g}" in str(lost)
+    missing = np.where(np.arange(len(z)) < 3, np.nan, z)
+    assert nearer_starts(model, missing)["c"] == pytest.approx(found["c"], abs=10)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement, with_unit
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.measurements.known import ConstrainedModel
-from ipe_bench.real.estimation import Question
+from ipe_bench.real.estimation import Question, nearer_starts
 from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import TOO_WELL, Fit
 from ipe_bench.real.residuals import LEAST_P
@@ -182,6 +182,10 @@ class Answer(Labelled[Fit]):
                 f"The readings do not determine {what} (at {one.label}); fix parameters, or give"
                 " prior, until they do."
             )
+        if self._lacking or not self.passes:
+            for name, value in nearer_starts(self.model, self.z).items():
+                start = f"measurement.start.{name}={value:.3g}"
+                yield Strong(f"The readings are far from those of the start; try {start}.")
 
     @property
     def _lacking(self) -> list[Fit]:
