@@ -21,6 +21,7 @@ import pandas as pd
 import pytest
 import state_tables
 import word_drawings
+import yaml
 from docs_types import show_type, type_of
 from gallery_frames import KEPT, SUFFIX, Computed, read
 from shared.synthetic_store import Pretender, Seeker, Synthetic
@@ -412,6 +413,70 @@ def commands(page: Path) -> list[list[str]]:
     whole."""
     typed = "".join(blocks(page, "console")).replace("\\\n", "")
     return [shlex.split(line.removeprefix("$ ipe-bench ")) for line in typed.splitlines()]
+
+
+def conditioned(page: str, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the scored states at the end given all readings, from their joint
+    normal density: without an added state, and without a recursion."""
+    count = len(z)
+    initial_x, initial_v, *noises = np.eye(2 + count)  # what everything else is a sum of
+    x, v = initial_x, initial_v
+    rows = []
+    for w in noises:
+        before = x
+        x = 0.9 * x + w if page == "correlated" else x + v
+        v = v + w
+        rows.append({"coloured": x, "correlated": x + 0.5 * w, "delayed": before}[page])
+    lag = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    white = {"coloured": 0.2, "correlated": 0.3, "delayed": 0.5}[page]
+    R = white**2 * np.eye(count) + (page == "coloured") * 0.8**lag
+    drawn = np.diag([25.0, 1.0] + [1.0 if page == "correlated" else 0.01] * count)
+    H = np.array(rows)
+    scored = np.array([x] if page == "correlated" else [x, v])
+    gain = np.linalg.solve(H @ drawn @ H.T + R, H @ drawn @ scored.T).T
+    return gain @ z, (scored - gain @ H) @ drawn @ scored.T
+
+
+@pytest.mark.parametrize("name", ["coloured", "correlated", "delayed"])
+def test_noise_as_an_added_state_is_exact(name, tmp_path):
+    write_files(PAGES / "howto" / "added_states.md", tmp_path)
+    model = ipe_bench.states.Formulas(
+        **yaml.safe_load((tmp_path / f"{name}.yaml").read_text("utf-8")), count=20
+    )
+    z = np.cumsum(np.random.default_rng(1).standard_normal(20))
+    mean, covariance = conditioned(name, z)
+    for tracker in ("ekf", "auto"):
+        estimators = {tracker: ipe_bench.component(f"tracker/{tracker}")}
+        (track,) = ipe_bench.estimate(model, z[:, None], estimators)
+        states = slice(len(mean))
+        np.testing.assert_allclose(track.mean[-1][states], mean, rtol=1e-9)
+        np.testing.assert_allclose(track.covariance[-1][states, states], covariance, rtol=1e-8)
+
+
+def test_who_comes_from_another_tool_finds_the_same_estimates(tmp_path, monkeypatch):
+    """SciPy's curve_fit, and filterpy's Kalman filter."""
+    page = PAGES / "howto" / "from_others.md"
+    write_files(page, tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "oxygen", raising=False)
+    fit, track = {}, {}
+    _, fitted, filtered = blocks(page, "python")
+    exec(fitted, fit)
+    np.testing.assert_allclose(fit["answer"].x, fit["values"], rtol=1e-5)
+    np.testing.assert_allclose(fit["answer"].covariance, fit["covariance"], rtol=1e-3)
+    exec(filtered, track)
+    np.testing.assert_allclose(track["track"].mean[-1], track["kalman"].x.ravel(), rtol=1e-12)
+    np.testing.assert_allclose(track["track"].covariance[-1], track["kalman"].P, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("deviation", "p"), [(2.5, "0.385"), (0.25, "1e-88")])
+def test_a_stated_noise_is_tested_as_the_answers_to_questions_say(hour, deviation, p):
+    assert f"p = {p}" in (PAGES / "howto" / "questions.md").read_text(encoding="utf-8")
+    model = ipe_bench.measurements.Function(of="oxygen:demand")
+    estimators = {"levenberg_marquardt": ipe_bench.baselines.LevenbergMarquardt()}
+    (fit,) = ipe_bench.estimate(model, "oxygen.csv", estimators, noise=Gaussian(deviation))
+    assert f"{fit.p_value:.3g}" == p or f"{fit.p_value:.0e}" == p
+    assert fit.fits == (deviation == 2.5)
 
 
 @pytest.fixture
