@@ -24,6 +24,9 @@ looked at again."""
 _FARTHER_BY = 1e-12
 """Change of readings that rounding may cause, as a share of the largest reading."""
 
+_FAR = 100.0
+"""Multiple of its spread beyond which a column is far from 0."""
+
 
 class WrittenModel(Measurement):
     """Defines a model whose parameters are names with a start; `start`, `columns` and `unit` are
@@ -139,12 +142,30 @@ class WrittenModel(Measurement):
                     names.append(self.parameters[i].name)
         if not names:
             return ()
+        far = self._far_columns()
+        if far:
+            return (
+                f"readings do not change with {', '.join(names)} at the start; {far}, so that"
+                " starts fit it",
+            )
         return (
             f"readings do not change with small changes of {', '.join(names)}, but with larger"
             " ones: they are constant in pieces, as by floor, round, sign or a comparison, where"
             " every slope is 0, and no estimator that follows slopes moves from there; blend the"
             " pieces, as by tanh",
         )
+
+    def _far_columns(self) -> str:
+        """Says which columns are far from 0 beside their spread, and what to subtract from each."""
+        found = []
+        for name in self.headings:
+            column = self.column(name)
+            spread = np.ptp(column)
+            if 0.0 < _FAR * spread < np.abs(column).min():
+                unit = 10.0 ** np.ceil(np.log10(spread))
+                origin = np.floor(column.min() / unit) * unit
+                found.append(f"{name} is far from 0: subtract {origin:.15g} from it")
+        return ", ".join(found)
 
     def require_columns_and_parameters(self, *keys: str, readings: Sequence[str] = ()) -> None:
         """Refuses columns of different lengths, names in the options `keys` that are no parameters,
