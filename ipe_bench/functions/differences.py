@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 
 Rows = Callable[[Array], Array]
 Near = Callable[[Array, Array], Array]
@@ -39,6 +39,17 @@ _QUICKLY = 1e-7
 """Part of a slope by which three steps may disagree."""
 _TELLING = 1e-2
 """Part of a slope up to which the error of differences lets them say that it is right."""
+_ROUGHLY = 1e-4
+"""Part of a slope by which the sides of a step of a rough function may differ from it."""
+_OTHERS = (27.0, 1.0 / 9.0)
+"""Multiples of such steps that are tried where their sides disagree."""
+_CLOSELY = 1e-7
+"""Part of the largest slope to which steps are as good as wider ones."""
+_USUALLY = 10.0
+"""Multiple of what the sides of a step differ at points that are tried, up to which it is believed
+elsewhere."""
+_NEARLY_ALL = 0.9
+"""Share of the slopes that a step must find which is used in place of the ladder."""
 RIGHT, UNKNOWN, WRONG = 0, 1, 2
 
 
@@ -91,7 +102,8 @@ def measured(
         moved = _moved(h, x, directions, near, parts, _BESIDE * parts[-1] / 3)
         here, up, down, ahead, behind, _ = moved
         size = np.maximum(np.abs(here), np.maximum(np.abs(up), np.abs(down)))
-        noise = np.fmax(2 * _EPS * size, 3 * _scatter(here, moved.beside)) / ahead
+        coarse = 2 * _resolution(moved) * size
+        noise = np.fmax(coarse, 3 * _scatter(here, moved.beside)) / ahead
         # A step that is a few units of round-off of x is no step along the direction.
         widest = np.abs(directions).max(axis=2)
         blur = (_EPS * np.abs(x).max(axis=1)[:, None] / widest)[:, :, None] / ahead
@@ -134,6 +146,21 @@ def _moved(h: Rows, x: Array, directions: Array, near: Near, parts: Array, besid
         behind[..., None],
         placed(near_by, len(beside)),
     )
+
+
+def _resolution(moved: Moved) -> Array:
+    """Returns the relative distance (rows, p, m) of neighbouring values: that of single precision
+    where all that move have no more digits."""
+    here, up, down = moved.here, moved.up, moved.down
+    short = single(here) & single(up).all(axis=0) & single(down).all(axis=0)
+    moves = (up != here).any(axis=0) | (down != here).any(axis=0)
+    return np.where(short & moves, np.finfo(np.float32).eps, _EPS)
+
+
+def single(values: Array) -> Mask:
+    """Tells of each value whether it has no more digits than single precision holds."""
+    with np.errstate(all="ignore"):
+        return values == values.astype(np.float32)
 
 
 def _scatter(here: Array, beside: Array) -> Array:
@@ -220,6 +247,87 @@ def along_units(scale: Array, rows: int) -> Array:
     return np.broadcast_to(np.diag(scale), (rows, len(scale), len(scale)))
 
 
+class Steps(NamedTuple):
+    """Holds steps of central differences for a function that is rougher than round-off."""
+
+    widths: Array
+    """(n,)"""
+    apart: Array
+    """By how much the slopes (m, n) of either side may differ from the central ones."""
+
+
+def steps_of_a_rough_function(h: Rows, x: Array, scale: Array, near: Near) -> Steps | None:
+    """Finds the steps by which central differences find at the first and most others of the points
+    x (rows, n) what the whole ladder finds, to its error; None if there are none."""
+    units = along_units(scale, len(x))
+    parts = _RATIO ** -np.arange(LEVELS)
+    found = measured(h, x, units, near).central
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        slope, apart = _sided(_moved(h, x, units, near, parts, np.empty(0)))
+        size = np.abs(found.slope)
+        largest = size.max(axis=2, keepdims=True)
+        allowed = 3 * found.error + _TOLERANCE * np.maximum(size, _SMALL * largest)
+        away = np.abs(slope - found.slope)
+        # Per point and level, beside the largest slope of all outputs.
+        worst = (away / np.abs(found.slope).max(axis=1, keepdims=True)).max(axis=2)
+        usual = np.median(np.where(np.isfinite(worst), worst, np.inf), axis=1)
+        # The narrowest of good steps meets the fewest jumps and kinks.
+        narrowest = len(usual) - 1 - np.argmax(usual[::-1] <= _CLOSELY, axis=0)
+        good = (usual <= _CLOSELY).any(axis=0)
+        best = np.where(good, narrowest, np.argmin(usual, axis=0))
+        each = np.arange(len(scale))
+        right = away[best, :, :, each] <= allowed.transpose(2, 0, 1)
+        right |= ~np.isfinite(found.slope).transpose(2, 0, 1)
+        known = np.isfinite(usual[best, each]).all()
+        nearly = (right.mean(axis=2) >= _NEARLY_ALL).all(axis=0)
+        if not known or not nearly[0] or 2 * nearly.sum() <= len(x):
+            return None
+        apart = apart[best, :, :, each]
+        apart = np.median(np.where(np.isfinite(apart), apart, 0.0), axis=1).T
+        widths = scale * parts[best]
+        return Steps(widths, _USUALLY * apart / scale)
+
+
+def by_steps(h: Rows, x: Array, steps: Steps, near: Near) -> Array:
+    """Computes dh/dx (rows, m, n) at x (rows, n) by a central difference of those steps; where its
+    sides disagree, by a wider or narrower one if its sides agree better."""
+    slope, apart = _by_widths(h, x, steps.widths, near)
+    with np.errstate(all="ignore"):
+        size = np.abs(slope)
+        size = np.maximum(size, _SMALL * size.max(axis=2, keepdims=True))
+        allowed = np.maximum(steps.apart, _ROUGHLY * size)
+        rows = np.flatnonzero((apart > allowed).any(axis=(1, 2)))
+    for part in _OTHERS if rows.size else ():
+        other, by = _by_widths(h, x[rows], part * steps.widths, near)
+        better = by < apart[rows]
+        slope[rows] = np.where(better, other, slope[rows])
+        apart[rows] = np.where(better, by, apart[rows])
+    return slope
+
+
+def _by_widths(h: Rows, x: Array, widths: Array, near: Near) -> tuple[Array, Array]:
+    """Returns slopes (rows, m, n) by steps, and by how much those of each side differ from them."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        units = along_units(widths, len(x))
+        slope, apart = _sided(_moved(h, x, units, near, np.ones(1), np.empty(0)))
+        return slope[0] / widths, apart[0] / widths
+
+
+def _sided(moved: Moved) -> tuple[Array, Array]:
+    """Returns central differences (levels, rows, m, p) by the steps of each level, and by how much
+    those of each side differ from them: more than by the bend at a jump or a kink."""
+    ahead = (moved.up - moved.here) / moved.ahead
+    behind = (moved.here - moved.down) / moved.behind
+    return _central(moved), np.abs(ahead - behind).swapaxes(2, 3) / 2
+
+
+def _central(moved: Moved) -> Array:
+    """Returns central differences (levels, rows, m, p) by the steps of each level."""
+    return ((moved.up - moved.down) / (moved.ahead + moved.behind)).swapaxes(2, 3)
+
+
 def by_differences(
     h: Rows, x: Array, scale: Array, near: Near = unmoved, within: float = _QUICKLY
 ) -> Array:
@@ -240,11 +348,11 @@ def quick(h: Rows, x: Array, scale: Array, near: Near = unmoved) -> tuple[Array,
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         moved = _moved(h, x, along_units(scale, len(x)), near, parts, np.empty(0))
-        here, up, down, ahead, behind, _ = moved
-        C = ((up - down) / (ahead + behind)).swapaxes(2, 3)
+        here, up, down, ahead, _, _ = moved
+        C = _central(moved)
         slope = C[1] + (C[1] - C[0]) / (_RATIO**2 - 1.0)
         size = np.maximum(np.abs(here), np.maximum(np.abs(up), np.abs(down))).max(axis=0)
-        noise = (4 * _EPS * size / ahead[-1]).swapaxes(1, 2)
+        noise = (4 * _resolution(moved) * size / ahead[-1]).swapaxes(1, 2)
         # The finest step finds what the wide ones step over.
         apart = np.abs(slope - C[2]) - noise
         # What is extrapolated is no better than a part of its last correction.

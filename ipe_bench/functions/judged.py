@@ -15,11 +15,14 @@ from ipe_bench.functions.differences import (
     WRONG,
     Near,
     Rows,
+    Steps,
     along_units,
     by_differences,
+    by_steps,
     judge,
     measured,
     quick,
+    steps_of_a_rough_function,
     unmoved,
 )
 
@@ -85,6 +88,8 @@ class Judged:
     """Part of an output's terms by which it is rougher than round-off."""
     within: float = _QUICKLY
     """Part of a slope by which few differences may disagree."""
+    steps: Steps | None = None
+    """Steps of differences if the function is rough, such as by an integrator's tolerance."""
 
     def __call__(self, x: Array) -> Array:
         return self.function(x)
@@ -111,7 +116,14 @@ class Judged:
             return by_complex_steps(self.function, x)
 
     def differences(self, x: Array) -> Array:
+        if self.steps is not None:
+            return by_steps(self.function, x, self.steps, self.near)
         return by_differences(self.function, x, self.scale, self.near, self.within)
+
+    @property
+    def differences_cost(self) -> float:
+        """Calls of a row's differences, but where they doubt themselves."""
+        return float((6 if self.steps is None else 2) * len(self.scale) + 1)
 
     def wrong(self, x: Array, value: Array, J: Array) -> Mask:
         """Finds the rows (rows,) of x whose values or slopes are not the function's own: along one
@@ -196,6 +208,19 @@ def same_values(a: Array, b: Array) -> bool:
         return bool(alike.all())
 
 
+def with_differences(function: Rows, points: Array, scale: Array, near: Near = unmoved) -> Judged:
+    """Returns a function with the differences that suit it at most of the points (rows, n)."""
+    with np.errstate(all="ignore"):
+        # How far few differences may disagree is what they do there.
+        apart = quick(function, points, scale, near)[1].max(axis=1)
+        usual = float(np.median(np.where(np.isfinite(apart), apart, np.inf)))
+        within = min(max(_QUICKLY, 3 * usual), _ROUGH) if usual < _ROUGH else _QUICKLY
+        steps = None
+        if not (apart <= within).all():
+            steps = steps_of_a_rough_function(function, points, scale, near)
+        return Judged(function, scale, near, within=within, steps=steps)
+
+
 def judged(
     function: Rows, points: Array, scale: Array, near: Near = unmoved, what: str = "the function"
 ) -> Judged:
@@ -207,11 +232,7 @@ def judged(
     """
     require_by_row(function, points, what)
     with np.errstate(all="ignore"):
-        # How far few differences may disagree is what they do at most of the points.
-        apart = quick(function, points, scale, near)[1].max(axis=1)
-        usual = float(np.median(np.where(np.isfinite(apart), apart, np.inf)))
-        within = min(max(_QUICKLY, 3 * usual), _ROUGH) if usual < _ROUGH else _QUICKLY
-        tried = Judged(function, scale, near, within=within)
+        tried = with_differences(function, points, scale, near)
         value = np.asarray(tried(points), dtype=float)
         try:
             J = tried._by_complex_steps(points)

@@ -16,8 +16,12 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, nearest
 from ipe_bench.basics.options import Component
-from ipe_bench.functions.differences import by_differences
-from ipe_bench.functions.judged import Judged, by_complex_steps, widest_steps
+from ipe_bench.functions.judged import (
+    Judged,
+    by_complex_steps,
+    widest_steps,
+    with_differences,
+)
 
 Epochs = tuple[NDArray[np.intp], ...]
 
@@ -281,7 +285,23 @@ class Measurement(Component, ABC):
         if self.analytic:
             self._require_analytic()
             return by_complex_steps(self.simulate, x)
-        return by_differences(self.simulate, x, self.widest_steps, self.near)
+        return self._own_differences.differences(x)
+
+    @cached_property
+    def _own_differences(self) -> Judged:
+        try:
+            return self._with_differences(self._tried_points)
+        except Exception:  # it may refuse what is not near the nominal point
+            return self._with_differences(self._tried_points[:1])
+
+    def _with_differences(self, points: Array) -> Judged:
+        return with_differences(self.simulate, points, self.widest_steps, self.near)
+
+    @cached_property
+    def _tried_points(self) -> Array:
+        """Points (5, n) near the nominal one at which slopes are tried."""
+        offsets = np.random.default_rng(1).uniform(-0.3, 0.3, (4, self.n))
+        return self.nominal + np.vstack([np.zeros(self.n), offsets])
 
     def _require_analytic(self) -> None:
         """Raises UserError, at the first Jacobian, if complex steps do not find slopes that
@@ -296,8 +316,7 @@ class Measurement(Component, ABC):
 
     @cached_property
     def _is_analytic(self) -> bool:
-        offsets = np.random.default_rng(1).uniform(-0.3, 0.3, (4, self.n))
-        x = self.nominal + np.vstack([np.zeros(self.n), offsets])
+        x = self._tried_points
         with np.errstate(all="ignore"):
             J = by_complex_steps(self.simulate, x)
             own = Judged(self.simulate, self.widest_steps, self.near)

@@ -8,9 +8,10 @@ import inspect
 import os
 import sys
 import typing
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -233,8 +234,10 @@ class Function(WrittenModel):
 
     def _rows(self, x: Array) -> Array:
         """Computes h of every trial, by one call of the function each; x may be complex."""
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"), warnings.catch_warnings(record=True) as caught:
             rows = [self._checked(self._at(row), self.m) for row in x * self.sizes]
+        for one in caught:
+            _warn_once(self.of, str(one.message), one.category)
         return np.array(rows) if rows else np.empty((0, self.m))
 
     @cached_property
@@ -260,15 +263,31 @@ class Function(WrittenModel):
     @cached_property
     def _judged(self) -> Judged:
         """The function with its slopes, tried near the start and away from it."""
-        offsets = np.random.default_rng(1).uniform(-0.3, 0.3, (4, self.n))
-        points = self.nominal + np.vstack([np.zeros(self.n), offsets])
-        return judged(self._rows, points, self.widest_steps, self.near, f"measurement.of={self.of}")
+        what = f"measurement.of={self.of}"
+        found = judged(self._rows, self._tried_points, self.widest_steps, self.near, what)
+        return replace(found, why=self._why_complex_steps_fail()) if found.why else found
+
+    def _why_complex_steps_fail(self) -> str:
+        """Says why, as far as the start tells."""
+        values = np.array([*self.starts.values()])
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("error", np.exceptions.ComplexWarning)  # of functions of `math`
+            z = np.asarray(self._at(values))
+            if z.dtype in (np.float32, np.float16):
+                return f"it computes in single precision ({z.dtype}); compute in float64"
+            parameters = dict(zip(self.starts, values + 0j, strict=True))
+            try:
+                self.function(**parameters, **self._known)
+            except (Exception, SystemExit) as error:
+                return f"it takes no complex numbers ({type(error).__name__})"
+        return "complex steps find other slopes"
 
     def remarks(self, x: Array) -> tuple[str, ...]:
         remarks = self.flat(x)
         why = "" if self._jax is not None else self._judged.why
         if why:
-            remarks += (f"slopes of {self.of} are differences, as {why}; write it in NumPy",)
+            remarks += (f"slopes of {self.of} are differences, as {why}",)
         return remarks
 
     def simulate(self, x: Array) -> Array:
@@ -277,13 +296,15 @@ class Function(WrittenModel):
     def jacobian(self, x: Array) -> Array:
         if self._jax is not None:
             return self._jax[1](x)
+        if self._judged.why:
+            return self._judged.differences(x)
         return self._judged.slopes(x)[1]
 
     @property
     def jacobian_cost(self) -> float:
         if self._jax is not None:
             return float(self.n)
-        return float(6 * self.n if self._judged.why else self.n + 3)
+        return self._judged.differences_cost if self._judged.why else float(self.n + 3)
 
 
 def function(
@@ -299,6 +320,13 @@ def function(
             " another"
         )
     return Function(of=f"{module}:{name}", start=start or {}, **options)
+
+
+@cache
+def _warn_once(of: str, text: str, category: type[Warning]) -> None:
+    """Passes a warning of a function on: contexts that ignore warnings make Python forget which it
+    has shown."""
+    warnings.warn(f"{of}: {text}", category, stacklevel=2)
 
 
 def _in_chunks(program: Callable[[Array], Any]) -> Callable[[Array], Array]:

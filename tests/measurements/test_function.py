@@ -17,7 +17,11 @@ T = np.linspace(0.1, 4.0, 25)
 LAW = """
 from typing import Annotated
 import math
+import warnings
 import numpy as np
+from scipy.integrate import odeint
+
+TIMES = []
 
 def swing(t, length: Annotated[float, "m"] = 1.2, damping=0.1, *, g=9.80665):
     return np.exp(-damping * t / 2) * np.cos(np.sqrt(g / length) * t)
@@ -62,6 +66,21 @@ def leaving(t, k=1.0):
     if k != 1.0:
         raise SystemExit(3)
     return k * t
+
+def integrated(t, a=2.0, b=0.8):
+    TIMES.append(b)
+    return odeint(lambda y, s: -b * y * (1 - 0.1 * y), a, np.append(0.0, t))[1:, 0]
+
+def single(t, a=2.0, b=0.8):
+    t = np.float32(t)
+    return np.float32(a) * np.exp(-np.float32(b) * t)
+
+def warning(t, k=1.0):
+    warnings.warn("a long way", UserWarning)
+    return k.real * t
+
+def of_a_date(t, a=2.0, b=1.0):
+    return a * np.exp(-b * t)
 
 def no_parameter(t):
     return t
@@ -124,7 +143,7 @@ def test_a_function_is_the_model_that_its_formula_is(laws):
     assert len(ours.epochs) == len(T)
 
 
-@pytest.mark.parametrize(("name", "cost"), [("by_math", 12.0), ("absolute", 6.0)])
+@pytest.mark.parametrize(("name", "cost"), [("by_math", 13.0), ("absolute", 7.0)])
 def test_slopes_are_differences_where_the_complex_step_is_wrong(laws, name, cost):
     ours = model(name)
     x = ours.nominal[None] * 1.05
@@ -353,3 +372,53 @@ def test_parameters_of_which_readings_are_constant_in_pieces_are_named(laws):
     (said,) = model("rounded").remarks(model("rounded").nominal)
     assert said.startswith("readings do not change with small changes of a, but with larger ones")
     assert model("swing").remarks(model("swing").nominal) == ()
+
+
+def test_slopes_of_an_integrator_take_few_calls_and_are_booked(laws):
+    ours = model("integrated")
+    x = ours.nominal + np.random.default_rng(5).uniform(-0.3, 0.3, (40, 2))
+    ours.jacobian(x[:1])
+    import some_laws
+
+    some_laws.TIMES.clear()
+    J = ours.jacobian(x)
+    assert len(some_laws.TIMES) == ours.jacobian_cost * len(x) == 5.0 * len(x)
+
+    def logistic(x):
+        a, b = (x * ours.sizes).T[..., None]
+        g = np.exp(-b * T)
+        return a * g / (1 - 0.1 * a * (1 - g))
+
+    exact = differentiate(logistic, x, analytic=True)
+    assert (np.abs(J - exact) <= 2e-5 * np.abs(exact).max(axis=1, keepdims=True)).all()
+    assert all(np.array_equal(J[i : i + 1], ours.jacobian(x[i : i + 1])) for i in (0, 7))
+
+
+def test_slopes_in_single_precision_are_found_and_named(laws):
+    ours = model("single")
+    (said,) = ours.remarks(ours.nominal)
+    assert said.endswith("it computes in single precision (float32); compute in float64")
+    J = ours.jacobian(ours.nominal[None])[0] / ours.sizes
+    g = np.exp(-0.8 * T)
+    np.testing.assert_allclose(J, np.stack([g, -2 * T * g], axis=-1), atol=1e-4)
+
+
+def test_why_complex_steps_fail_is_said_only_where_it_is_known(laws):
+    (said,) = model("by_math").remarks(model("by_math").nominal)
+    assert said.endswith("as it takes no complex numbers (ComplexWarning)")
+    (said,) = model("absolute").remarks(model("absolute").nominal)
+    assert said.endswith("as complex steps find other slopes")
+
+
+def test_a_warning_of_a_function_is_given_once(laws):
+    ours = model("warning")
+    x = np.repeat(ours.nominal[None], 3, axis=0)
+    with pytest.warns(UserWarning, match="a long way") as given:
+        ours.jacobian(x)
+    assert len(given) == 1
+
+
+def test_a_column_far_from_0_is_named_where_readings_do_not_change(laws):
+    ours = ib.measurements.Function(of="some_laws:of_a_date", columns={"t": 2460000.5 + T})
+    (said,) = ours.remarks(ours.nominal)
+    assert "t is far from 0: subtract 2460000 from it" in said
