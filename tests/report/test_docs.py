@@ -205,6 +205,17 @@ def test_the_errors_under_a_wrong_model_are_the_stored_ones():
         assert row == pytest.approx([*others, 100 * misfit], rel=0.02)
 
 
+def test_the_traps_of_reading_a_report_are_the_stored_ones():
+    page = (PAGES / "explanation" / "how_to_read.md").read_text(encoding="utf-8")
+    known = totals(read(pages.STORED / f"headline{SUFFIX}")).set_index(["estimator", "error_scale"])
+    lost = known.loc[("fixed_point", 300)]
+    assert f"median error of {lost['error_median']:.2f} bounds" in page
+    assert f"fails in {100 * (1 - lost['success']):.1f} % of trials" in page
+    narrow = known.loc[("ukf", 100)]
+    assert f"`ukf` succeeds in all {narrow['trials']:.0f} trials" in page
+    assert (narrow["success"], narrow["verdict"]) == (1, "overconfident")
+
+
 def test_the_pairs_of_states_account_for_the_shares_beside_them():
     """Of 200 trials, `auto` holds more by those that it alone holds, less those that the other
     alone holds."""
