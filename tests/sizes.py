@@ -1,5 +1,5 @@
-"""How large and how dense each room is, as the table that `make lint` prints: for a maintainer to
-read, and no test.
+"""How large and how dense each room is, as the table that `make lint` prints, and the limits that
+`test_sizes.py` holds.
 
 Content is counted in nodes of the syntax tree, without docstrings, annotations, imports and
 signatures, so that neither lines nor prose weigh. A dense statement has more than fifteen nodes; in
@@ -9,6 +9,7 @@ well-kept libraries of the field three to nine statements in a hundred are dense
 from __future__ import annotations
 
 import ast
+import csv
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -16,9 +17,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 DENSE = 15
 """Nodes from which on a statement counts as dense."""
-CEILINGS = {"ipe_bench": 162_000, "all but engine, questions and workshop": 139_000}
-SPECIAL = ("engine", "questions", "workshop")
-"""Rooms that a newcomer need not know."""
+LIMITS = Path(__file__).parent / "room_limits.tsv"
+"""A row per room: its largest content, and what users got for each time that it was raised."""
 _NO_CONTENT = (ast.expr_context, ast.operator, ast.cmpop, ast.boolop, ast.unaryop)
 _FRAME = (
     *(ast.Import, ast.ImportFrom, ast.alias, ast.FunctionDef),
@@ -86,12 +86,21 @@ def gauges(path: Path) -> Counter[str]:
     return Counter(
         files=1,
         lines=len(source.splitlines()),
-        content=sum(not isinstance(node, (*_NO_CONTENT, *_FRAME)) for node in nodes),
+        content=_content(nodes),
         statements=len(simple),
         dense=sum(number > DENSE for number in simple),
         packed=len(packed),
         walruses=sum(isinstance(node, ast.NamedExpr) for node in nodes),
     )
+
+
+def content(path: Path) -> int:
+    """Counts the content of a file."""
+    return _content(ast.walk(without_prose(ast.parse(path.read_text(encoding="utf-8")))))
+
+
+def _content(nodes: Iterable[ast.AST]) -> int:
+    return sum(not isinstance(node, (*_NO_CONTENT, *_FRAME)) for node in nodes)
 
 
 def _is_table(statement: ast.Assign | ast.AnnAssign) -> bool:
@@ -115,20 +124,30 @@ def row(name: str, found: Counter[str]) -> str:
     )
 
 
+def room_files() -> dict[str, list[Path]]:
+    """The package's files by room: a folder of `ipe_bench`, or a module at its top."""
+    package = ROOT / "ipe_bench"
+    rooms: dict[str, list[Path]] = {}
+    for path in python_files(package, tests=False):
+        room = path.relative_to(package).with_suffix("").parts[0]
+        rooms.setdefault(room, []).append(path)
+    return rooms
+
+
+def limits() -> dict[str, int]:
+    """The largest content that each room may have."""
+    with LIMITS.open(encoding="utf-8", newline="") as file:
+        return {one["room"]: int(one["limit"]) for one in csv.DictReader(file, delimiter="\t")}
+
+
 def rows() -> Iterator[str]:
     package = ROOT / "ipe_bench"
     yield f"{'':<40}{'files':>6}{'lines':>8}{'content':>9}{'dense':>8}{'packed':>8}{'walruses':>10}"
-    rooms: dict[str, list[Path]] = {}
-    for path in python_files(package, tests=False):
-        parts = path.relative_to(package).with_suffix("").parts
-        rooms.setdefault(parts[0], []).append(path)
-    found = {room: summed(files) for room, files in rooms.items()}
+    found = {room: summed(files) for room, files in room_files().items()}
+    allowed = limits()
     for room in sorted(found, key=lambda room: -found[room]["content"]):
-        yield row(room, found[room])
-    main = sum((one for room, one in found.items() if room not in SPECIAL), Counter())
-    for name, total in zip(CEILINGS, (sum(found.values(), Counter()), main), strict=True):
-        over = " (over)" if total["content"] > CEILINGS[name] else ""
-        yield f"{row(name, total)}, content of at most {CEILINGS[name]:,}{over}"
+        yield f"{row(room, found[room])}, at most {allowed.get(room, 0):,}"
+    yield row("ipe_bench", sum(found.values(), Counter()))
     for plugin in sorted({path.parent for path in (ROOT / "plugins").rglob("pyproject.toml")}):
         yield row(str(plugin.relative_to(ROOT)), summed(python_files(plugin, tests=False)))
     tests = [*python_files(ROOT / "tests", tests=True), *python_files(ROOT / "plugins", tests=True)]
