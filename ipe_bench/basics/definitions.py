@@ -282,7 +282,7 @@ class Definitions:
         known = function.__globals__
         text, names, attributes = _read(code)
         if names & _BEYOND_NAMES - known.keys():
-            names = frozenset(name for name in known if not name.startswith("_"))
+            names |= {name for name in known if not name.startswith("_")}
         module = sys.modules.get(function.__module__)
         of_module = known is getattr(module, "__dict__", None)
         in_file = of_module and function.__module__ != "__main__"

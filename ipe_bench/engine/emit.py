@@ -995,6 +995,10 @@ class _Vectors:
             builder.fcmp_ordered("<", rest, zero), builder.fcmp_ordered("<", b, zero)
         )
         moved = builder.fadd(rest, b)
+        # A rest of 0 has the sign of what divides, too, which arctan2 tells.
+        below = builder.fcmp_ordered("<", b, zero)
+        nothing = builder.select(below, self.constant(-0.0), zero)
+        rest = builder.select(builder.fcmp_ordered("==", rest, zero), nothing, rest)
         return builder.select(builder.and_(some, other), moved, rest)
 
     def call(self, name: str, *args: Value) -> Value:

@@ -132,6 +132,18 @@ def test_a_recording_has_the_values_of_numpy(name):
     np.testing.assert_allclose(found, wanted, rtol=1e-15)
 
 
+def test_a_remainder_is_numpys_to_the_sign_of_its_zero():
+    numbers = [-4.0, -2.5, -0.0, 0.0, 0.3, 2.0, 5.0, np.inf, np.nan]
+    x = np.array([[a, b] for a in numbers for b in numbers])
+    one = written(lambda x: np.remainder(x[..., :1], x[..., 1:]), 2)
+    with np.errstate(all="ignore"):
+        found = compiled_rows(one)[0](x, np.array([one.numbers]))[:, 0]
+        wanted = np.remainder(x[:, 0], x[:, 1])
+    np.testing.assert_array_equal(found, wanted)
+    known = np.isfinite(wanted)
+    np.testing.assert_array_equal(np.signbit(found[known]), np.signbit(wanted[known]))
+
+
 K = 60
 
 

@@ -89,6 +89,10 @@ WAYS = {
         "def helper():\n    return {v}",
         "class By:\n    def by(self):\n        return eval('helper()')",
     ),
+    "private beside evaluated": (
+        "def _helper():\n    return {v}",
+        "class By:\n    def by(self):\n        return eval('0') + _helper()",
+    ),
 }
 KINDS = {
     "estimator": """

@@ -170,7 +170,9 @@ def _rows(a: Sample, b: Sample, alpha: float, tested: Container[str]) -> Iterato
         loss = _loss(column.kind, effect, column.first, a.n)
         if column.kind not in tested:
             effect = replace(effect, p=np.nan, e=np.nan)
-        row = head | {"quantity": column.quantity} | asdict(effect) | unsaid
+        # Honesty and bias are of the trials in which both answered.
+        of_column = {"quantity": column.quantity, "trials": len(column.first)}
+        row = head | of_column | asdict(effect) | unsaid
         yield _Compared(row, loss, int(np.sum(column.first != column.second)))
     row = head | {"quantity": "time"} | asdict(_times(a, b, one, other)) | unsaid
     yield _Compared(row, (np.nan, np.nan), 0)

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 
 ADEQUATE = 0.1
-"""Nats up to which a Gaussian may stand for another: a deviation is 40 % too large, or a mean half
-a deviation off."""
+"""Nats up to which a Gaussian may stand for another: a deviation is 40 % too large, or a mean 0.45
+deviations off."""
 SAME_LAW = 0.05
 """Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some
 tenths of a nat."""
