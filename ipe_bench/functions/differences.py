@@ -297,10 +297,10 @@ def by_steps(h: Rows, x: Array, steps: Steps, near: Near) -> Array:
         size = np.abs(slope)
         size = np.maximum(size, _SMALL * size.max(axis=2, keepdims=True))
         allowed = np.maximum(steps.apart, _ROUGHLY * size)
-        rows = np.flatnonzero((apart > allowed).any(axis=(1, 2)))
+        rows = np.flatnonzero((~(apart <= allowed)).any(axis=(1, 2)))
     for part in _OTHERS if rows.size else ():
         other, by = _by_widths(h, x[rows], part * steps.widths, near)
-        better = by < apart[rows]
+        better = ~(apart[rows] <= by) & np.isfinite(by)
         slope[rows] = np.where(better, other, slope[rows])
         apart[rows] = np.where(better, by, apart[rows])
     return slope
@@ -356,7 +356,7 @@ def quick(h: Rows, x: Array, scale: Array, near: Near = unmoved) -> tuple[Array,
         # The finest step finds what the wide ones step over.
         apart = np.abs(slope - C[2]) - noise
         # What is extrapolated is no better than a part of its last correction.
-        apart = np.fmax(apart, _QUICKLY * np.abs(slope - C[1]) / _SMALL)
+        apart = np.maximum(apart, _QUICKLY * np.abs(slope - C[1]) / _SMALL)
         largest = np.abs(slope).max(axis=2, keepdims=True)
         apart = apart / np.maximum(np.abs(slope), _SMALL * largest)
         still = (C == 0.0).all(axis=0)
@@ -369,7 +369,7 @@ def _by_ladders(h: Rows, x: Array, scale: Array, near: Near) -> Array:
     slope = first.slope.copy()
     with np.errstate(all="ignore"):
         size = np.abs(slope)
-        largest = np.fmax.reduce(size, axis=(1, 2), keepdims=True)
+        largest = np.fmax.reduce(size, axis=2, keepdims=True)
         settled = first.error <= _TOLERANCE * np.maximum(size, _SMALL * largest)
         rows = np.flatnonzero(~settled.all(axis=(1, 2)))
         if rows.size:

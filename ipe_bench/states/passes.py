@@ -149,6 +149,12 @@ def law_of(rule: Rule, n: int) -> Law | None:
     return None
 
 
+def numbers_of(rule: Rule, n: int) -> Any:
+    """Returns the numbers that a step of a rule has in its machine code."""
+    law = law_of(rule, n)
+    return law if isinstance(law, Regression) else None
+
+
 _NOTHING = Layout()
 
 
@@ -185,7 +191,9 @@ class _Form:
 
     def step(self) -> Step:
         sizes = self.sizes
-        return named_step(self.text, self, sizes.carried, self.each, self.shared, sizes.shown)
+        # A rule of a plugin may get other points by the same name: the numbers tell.
+        what = (self, numbers_of(self.kind.rule, sizes.n))
+        return named_step(self.text, what, sizes.carried, self.each, self.shared, sizes.shown)
 
     def text(
         self,

@@ -18,6 +18,7 @@ from ipe_bench.states import (
     Filter,
     GaussHermite,
     Normal,
+    SigmaPoints,
     Smoother,
     StateModel,
     Taylor,
@@ -156,6 +157,31 @@ def test_steps_by_epoch_and_large_matrices_give_the_same(rule, monkeypatch):
         np.testing.assert_allclose(found.log_likelihood, right.log_likelihood, rtol=1e-10)
         alone = tracker.track(other, z[1:2])
         assert np.array_equal(alone.mean[0], found.mean[1])
+
+
+def corners(reach):
+    """A rule by the name of Corners whose points lie at some distance."""
+
+    @dataclass(frozen=True)
+    class Corners(SigmaPoints):
+        def points(self, n):
+            s = reach * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
+            w = np.full(len(s), 0.5 / reach**2)
+            w[0] = 1 - n / reach**2
+            return s, w
+
+    return Corners()
+
+
+def test_another_rule_of_the_same_name_has_its_own_points(monkeypatch):
+    model = Pendulum(count=5)
+    z = model.draw(0, 2).z
+    found = [Filter(corners(reach)).track(model, z).mean for reach in (1.5, 2.5)]
+    monkeypatch.setattr(recorded, "_MOST_OPERATIONS", 0)
+    model = Pendulum(count=5)
+    right = [Filter(corners(reach)).track(model, z).mean for reach in (1.5, 2.5)]
+    np.testing.assert_allclose(found, right, atol=1e-9)
+    assert np.abs(found[0] - found[1]).max() > 1e-6
 
 
 class Curve:

@@ -170,7 +170,7 @@ def _rows(a: Sample, b: Sample, alpha: float, tested: Container[str]) -> Iterato
         loss = _loss(column.kind, effect, column.first, a.n)
         if column.kind not in tested:
             effect = replace(effect, p=np.nan, e=np.nan)
-        # Honesty and bias are of the trials in which both answered.
+        # Honesty and bias are of fewer trials than were matched.
         of_column = {"quantity": column.quantity, "trials": len(column.first)}
         row = head | of_column | asdict(effect) | unsaid
         yield _Compared(row, loss, int(np.sum(column.first != column.second)))

@@ -256,6 +256,8 @@ def _claims(
         if fit.given.noise.estimated:
             # As `estimate` reports it, which does not know the level.
             scale = np.sqrt(chi_square / free)
+            # An answer that has no readings has no interval, not an infinite one.
+            scale = np.where(np.isfinite(scale), scale, 0.0)
             freedom = free
         width = half_width(CONFIDENCE, freedom) * scale
         claims.append(_claim(label, told, model, each, truth, near, np.asarray(width)))
