@@ -168,6 +168,8 @@ def _is_truth(value: Any) -> bool:
 def call(name: str, *given: Any) -> Any:
     """Applies a function of NumPy to unknowns and numbers."""
     graph = next(one.node.graph for one in given if type(one) is Unknown)
+    if name in _OF_TRUTHS_ALONE and not all(map(_is_truth, given)):
+        raise graph.refuse(f"np.{name} of numbers is not recorded")
     name = _SAME.get(name, name)
     if name not in _OPERATIONS:
         raise graph.refuse(f"np.{name} is not recorded")
@@ -203,7 +205,13 @@ def _of_truths(graph: ExactGraph, name: str, truths: Sequence[bool]) -> str:
         return name
     if name in ("subtract", "negative"):
         raise graph.refuse(f"np.{name} of truth values is an error")
-    return {"add": "logical_or", "multiply": "logical_and"}.get(name, name)
+    if name in _TRUTHS or name == "where":
+        return name
+    if name in ("add", "maximum", "fmax"):
+        return "logical_or"
+    if name in ("multiply", "minimum", "fmin"):
+        return "logical_and"
+    raise graph.refuse(f"np.{name} of truth values is not recorded")
 
 
 def _number(graph: ExactGraph, one: Any) -> Expression:
@@ -228,6 +236,8 @@ _SAME = {
     "rad2deg": "degrees",
     "float_power": "power",
 }
+_OF_TRUTHS_ALONE = ("bitwise_and", "bitwise_or", "bitwise_xor", "logical_xor")
+"""Functions that of numbers are errors, or are something else."""
 _TRUTHS = {
     *("less", "less_equal", "greater", "greater_equal", "equal", "not_equal"),
     *("logical_and", "logical_or", "invert", "isnan", "isfinite", "isinf"),
@@ -396,7 +406,7 @@ def _counted(array: Any) -> Any:
     """Returns truth values as the numbers 1 and 0."""
     if not any(_is_truth(one) for one in array.ravel()):
         return array
-    return _by_entry(lambda a: call("multiply", a, 1.0) if is_unknown(a) else a, array)
+    return _by_entry(lambda a: call("multiply", a, 1.0) if is_unknown(a) else float(a), array)
 
 
 def _has_unknowns(key: Any) -> bool:
@@ -485,7 +495,9 @@ def _interp(x: Any, xp: Any, fp: Any) -> Any:
     return np.where(x >= places[-1], values[-1], found)
 
 
-def _norm(x: Any, axis: Any = None, keepdims: bool = False) -> Any:
+def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Any:
+    if ord is not None and (ord != 2 or not isinstance(axis, int)):
+        raise NotImplementedError(f"np.linalg.norm of order {ord} is not recorded")
     return np.sqrt(np.sum(x * x, axis=axis, keepdims=keepdims))
 
 

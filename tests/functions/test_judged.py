@@ -101,6 +101,10 @@ def _swallowed(x):
         (lambda x: -(x > 0), "truth values"),
         (lambda x: x * 1j, "complex"),
         (lambda x: {}.get(x[0, 0], x), "key"),
+        (lambda x: (x > 0) & x, "of numbers"),
+        (lambda x: np.logical_xor(x, 1.0) * x, "of numbers"),
+        (lambda x: np.sqrt(x > 0) * x, "of truth values"),
+        (lambda x: np.linalg.norm(x, 1, axis=-1, keepdims=True), "order 1"),
     ],
 )
 def test_what_would_be_recorded_as_another_function_is_refused(function, why):
@@ -118,6 +122,7 @@ TRUTHS = {
     "a limit": lambda a, b: np.clip(a, b, 1.0) + np.isinf(1 / a) * 3.0,
     "a mean": lambda a, b: np.mean([a, b, a * b], axis=0),
     "how many": lambda a, b: np.sum(np.stack([a > 0, b > 0, a > b]), axis=0) * b,
+    "the larger of truths": lambda a, b: np.maximum(a > 0, b > 0) + (a > b),
 }
 
 
