@@ -185,7 +185,7 @@ class Answer(Labelled[Fit]):
         if self._lacking or not self.passes:
             for name, value in nearer_starts(self.model, self.z).items():
                 start = f"measurement.start.{name}={value:.3g}"
-                yield Strong(f"The readings are far from those of the start; try {start}.")
+                yield Strong(f"The readings are far from the readings of the start; try {start}.")
 
     @property
     def _lacking(self) -> list[Fit]:
