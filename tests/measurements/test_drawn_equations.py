@@ -75,20 +75,26 @@ def test_scipy_has_an_answer_for_nearly_all_drawn_equations():
     assert sum(len(z) == 0 for z in stored) < 0.05 * COUNT
 
 
+TENTHS = [
+    pytest.param(start, marks=pytest.mark.slow if start < 3 else pytest.mark.campaign)
+    for start in range(10)
+]
+"""Tenths of the drawn equations, of which every one has all kinds: three stand for all, and the
+others wait for a campaign."""
+
+
 @pytest.mark.oracle(
     "library: SciPy's solve_ivp, on the text of the equations",
     "readings of 500 drawn models, in tolerances of the model",
     3.0,
 )
-@pytest.mark.slow
-@pytest.mark.parametrize("start", range(10))
+@pytest.mark.parametrize("start", TENTHS)
 def test_readings_of_all_drawn_equations_are_those_of_scipy(start):
     for number, expected in list(enumerate(answers()))[start:HARD:10]:
         check(number, expected)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("start", range(10))
+@pytest.mark.parametrize("start", TENTHS)
 def test_all_readings_beside_poles_and_pulses_or_magnified_are_right_or_absent(start):
     stored = answers()
     numbers = range(HARD + start, COUNT, 10)
