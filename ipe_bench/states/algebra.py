@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, Mask, finite, multiply
-from ipe_bench.engine.chains import lower
+from ipe_bench.engine.scan import orthogonalised
 
 _SMALL = 1e-12
 """Pivots, in parts of the variances, below which a covariance counts as singular."""
@@ -115,12 +115,18 @@ def half(P: Array, L: Array | None = None) -> Half:
 
 
 def triangular(P: Array) -> Array:
-    """Computes lower triangular F, F F' = P, of positive semidefinite P (trials, n, n)."""
+    """Computes lower triangular F, F F' = P, of positive semidefinite P (trials, n, n); columns
+    whose pivots are 0 are 0, as `over` takes it."""
     parts = half(P)
     rows = parts.singular
     F = parts.G.copy()
     if rows.any():
-        F[rows] = lower(F[rows])
+        G = np.moveaxis(F[rows], 0, -1)
+        found = np.zeros(G.shape)
+        for i, row in enumerate(orthogonalised([[*row] for row in G], len(G), _LOST)):
+            for j in range(i + 1):
+                found[i, j] = row[j]
+        F[rows] = np.moveaxis(found, -1, 0)
     return F
 
 

@@ -231,6 +231,38 @@ def test_triangular_roots_are_those_of_their_covariances():
     np.testing.assert_allclose(found @ regular, X, atol=1e-13)
 
 
+@pytest.mark.parametrize("first", [0, 1, 2])
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: type(rule).__name__)
+def test_slopes_beside_states_that_are_known_are_those_of_the_function(rule, first):
+    """Such states stand first, between others or last, and two others are known together."""
+    rng = np.random.default_rng(first)
+    G = np.roll(np.diag([0.0, 2.0, 0.0, 3.0]) @ rng.normal(size=(4, 3)), first, axis=0)
+    H = rng.normal(size=(3, 4))
+    P = (G @ G.T)[None]
+    A, b, W = rule.linearise(lambda x: x @ H.T, np.ones((1, 4)), P)
+    np.testing.assert_allclose(A[0] @ G, H @ G, atol=1e-12)
+    np.testing.assert_allclose(A.sum(axis=2) + b, H.sum(axis=1)[None], rtol=1e-12)
+    np.testing.assert_allclose(W, 0.0, atol=1e-12)
+
+
+def test_smoothers_about_paths_hold_beside_states_that_are_known_at_the_start():
+    """Of a linear model they are the smoother itself: the first states were taken as all known."""
+    model = ib.states.Formulas(
+        next={"x": "x + v", "v": "v", "c": "c + w"},
+        readings={"z": "x + c"},
+        noise={"w": 0.3},
+        deviation={"z": 0.1},
+        spread={"x": 0.0, "v": 1.0, "c": 0.0},
+        count=8,
+    )
+    z = model.draw(0, 4).z
+    once = Smoother(Filter(Cubature())).track(model, z)
+    again = ib.states.IteratedSmoother(Filter(Cubature()), Cubature(), 1).track(model, z)
+    np.testing.assert_allclose(again.mean, once.mean, atol=1e-9)
+    np.testing.assert_allclose(again.covariance, once.covariance, atol=1e-9)
+    np.testing.assert_allclose(again.start.covariance, once.start.covariance, atol=1e-9)
+
+
 def test_a_negative_weight_that_leaves_no_covariance_has_no_track():
     """Of a square, points of a negative central weight may leave a negative variance."""
     square = ib.states.Formulas(
