@@ -3,6 +3,7 @@ trials."""
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections import defaultdict
 from dataclasses import dataclass, field
@@ -29,7 +30,7 @@ from ipe_bench.plugins import discovery
 from ipe_bench.report.finding import MEANING
 from ipe_bench.report.page.headline import about, headline, in_common, success
 from ipe_bench.report.tables.reports import all_tables
-from ipe_bench.report.tables.table import Table
+from ipe_bench.report.tables.table import Fact, Table
 from ipe_bench.report.words import percent
 from ipe_bench.states import Smoother, ekf
 from ipe_bench.statistics import analyse
@@ -453,3 +454,10 @@ def test_the_line_below_the_title_says_which_error_makes_a_trial_a_success(synth
     rows = analysis.summary[analysis.summary["parameter"] == "all"].set_index("estimator")
     assert rows["success"].to_dict() == {"inside": 1.0, "outside": 0.0}
     assert f"A trial succeeds if its error is at most {limit:.1f} times the" in success(analysis)
+
+
+def test_a_fact_comes_back_from_another_process_as_it_was():
+    fact = Fact("Price", "simulations of a trial: 12")
+    again = pickle.loads(pickle.dumps(fact))
+    assert (again, again.label, again.text) == (fact, fact.label, fact.text)
+    assert again == "Price: simulations of a trial: 12"

@@ -86,6 +86,10 @@ class Fact(str):
         one.text = f"{text[:1].upper()}{text[1:]}"
         return one
 
+    def __getnewargs__(self) -> tuple[str, str]:
+        """Lets it be copied and sent to other processes."""
+        return self.label, self.removeprefix(f"{self.label}: ")
+
     label: str
     text: str
 
