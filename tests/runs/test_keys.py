@@ -120,9 +120,10 @@ def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_el
 def test_a_change_to_states_that_move_makes_stale_what_is_computed_with_them_and_no_constants(
     copy, before
 ):
-    # Filters of constants update as trackers do; bounds of states are those of a filter and of a
+    # Filters of constants linearise as trackers do; bounds of states are those of a filter and of a
     # smoother.
-    changed = {"states/trackers.py": {"track", "path", "ukf"}, "trials/paths.py": {"track", "path"}}
+    changed = {"states/linearisation.py": {"track", "path", "ukf"}}
+    changed |= {"states/trackers.py": {"track", "path"}, "trials/paths.py": {"track", "path"}}
     changed |= {"states/smoothers.py": {"track", "path"}, "states/particles.py": set()}
     for module, stale in changed.items():
         edit(

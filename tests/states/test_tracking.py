@@ -194,7 +194,7 @@ def test_trackers_that_are_named_are_all_that_an_experiment_runs():
             )
 
     assert list(chosen("tracker=[ekf,ipls]")) == ["ekf", "ipls"]
-    assert len(chosen()) == 11
+    assert len(chosen()) == 12
     assert chosen()["ipls"] == IteratedSmoother(ukf(), Cubature())
 
 
@@ -385,7 +385,8 @@ def test_nees_of_the_kalman_filter_lies_within_its_limits_as_often_as_is_said():
     """1,000 studies of 40 trials: the mean NEES at the last epoch, and the verdict on the whole
     path."""
     table = ib.run([StateScenario(LINEAR, seed=s) for s in range(2)], {"kf": ekf()}, 20)
-    low, high = row(table, "kf")["nees_low_if_honest"], row(table, "kf")["nees_high_if_honest"]
+    found = row(table, "kf")
+    low, high = found["nees_solved_low_if_honest"], found["nees_solved_high_if_honest"]
     paths = LINEAR.draw(0, 40_000)
     tracks = ekf().track(LINEAR, paths.z)
     e = (tracks.mean - paths.x)[:, -1]

@@ -55,7 +55,7 @@ def test_trackers_of_singular_covariances_are_calibrated():
     )
     rows = table[table["parameter"] == "all"].set_index("estimator")
     assert (rows["converged"] == 1).all()
-    assert rows["nees"].between(*mean_limits(11, 12, 0.9999)).all(), rows["nees"]
+    assert rows["nees_mean"].between(*mean_limits(11, 12, 0.9999)).all(), rows["nees_mean"]
     assert np.isnan(rows["van_trees"]).all()
     assert len(table) == len(TRACKERS) * (len(Gins().parameters) + 1)  # the motion is not scored
 
