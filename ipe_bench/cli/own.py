@@ -27,15 +27,19 @@ _MOST_READINGS = 4_000_000
 sets."""
 _FEWEST = 20
 """Fewest of either that say anything of shares."""
+_REFUSED = "has no meaning with a model and readings of your own"
 _WITHOUT_MEANING = (*of("run", "figures"), TRUTH, "find", "experiment")
 
 
 def own_command(short: Short) -> int:
     """Simulates data like those in the files of a short form, prints which estimator to take, and
     writes files; returns 1 if none is to be taken."""
+    flags = [word for word in short.words if word.startswith("-")]
+    if flags:
+        raise UserError(f"{flags[0]}: {_REFUSED}; leave it out")
     choice = [f"{group}=[{','.join(names)}]" for group, names in standard.OF_OWN.items()]
     asked = single("run", short.words, choice)
-    asked.words.refuse(_WITHOUT_MEANING, "has no meaning with a model and readings of your own")
+    asked.words.refuse(_WITHOUT_MEANING, _REFUSED)
     trials = asked.spec.trials
     if trials is not None and trials < _FEWEST:
         raise UserError(f"trials={trials}: are too few to know shares by; give at least {_FEWEST}")

@@ -194,9 +194,7 @@ formats=pdf,md,tex  {MEANING}
         "",
         "",
         {
-            "names": _several(
-                "GROUP", "solver, measurement, ... or keys; solver/newton: its options"
-            ),
+            "names": _several("GROUP", "solver, measurement, ...; solver/newton: its options"),
             "-v --verbose": {
                 "action": "store_true",
                 "help": "with the options of each, and the columns of readings files",

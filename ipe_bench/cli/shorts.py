@@ -114,7 +114,7 @@ def _typed_files(word: str) -> list[str]:
 
 
 def _reading_named(word: str) -> str:
-    """Returns the reading that a formula names, as in y = a*t + b; empty if the word is none."""
+    """Returns y of a formula y = a*t + b, which names its reading; empty if the word is none."""
     named = _NAMED.fullmatch(word)
     if named is None or named["reading"] in {*KEYS, *plugins.groups()}:
         return ""

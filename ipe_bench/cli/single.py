@@ -52,6 +52,17 @@ class Single:
         return reserved_folder(folder, name, identity, elsewhere=not named, files=files)
 
 
+def _refuse_sweeps(words: Words) -> None:
+    """Refuses a word of a sweep: these commands have one job, and no -m."""
+    for one in words.overrides:
+        word = w.said(one)
+        if one.is_sweep_override() or w.swept(word) != word:
+            raise UserError(
+                f"{word}: is a sweep, which only runs of simulated trials take; give one value, or"
+                " put a list in brackets"
+            )
+
+
 def single(
     command: str,
     arguments: Sequence[str],
@@ -68,6 +79,7 @@ def single(
             words.refuse(
                 keys, f"is for `ipe-bench {whose}`, and has no meaning in `ipe-bench {command}`"
             )
+        _refuse_sweeps(words)
         unsaid = [one for one in standard if one.partition("=")[0] not in words.keys]
         given = w.read(command, unsaid)
         jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)

@@ -231,9 +231,6 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
         homes = [group for group, names in groups.items() if word in names]
         remedies = [f"write {_choosing(group, word)}" for group in homes]
         remedy = " or ".join(remedies) or f"see `ipe-bench {command} --help`"
-        if Path(word).suffix in (".csv", ".parquet"):
-            program = "" if command == "estimate" else "ipe-bench estimate "
-            remedy = f"write {program}readings={word}"
         raise UserError(f"{word}: is not KEY=VALUE; {remedy}")
     try:
         found = OverridesParser.create().parse_override(word)

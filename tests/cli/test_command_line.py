@@ -123,11 +123,20 @@ MISTAKES = {
         ["run", "estimators.newtn.max_iterations=9"],
         "did you mean newton?",
     ),
-    "a file for its key": (
-        ["estimate", "my.csv"],
-        "my.csv: is not KEY=VALUE; write readings=my.csv",
+    "a sweep of a command that has one job": (
+        ["estimate", "measurement=nist/misra1a", "error_scale=1,2"],
+        "error_scale=1,2: is a sweep, which only runs of simulated trials take; give one value",
     ),
-    "a file for another command": (["run", "my.csv"], "write ipe-bench estimate readings=my.csv"),
+    "a file without a model": (
+        ["estimate", "my.csv"],
+        "no model is given; write a function's file, a formula in quotes or a YAML file before it:"
+        ' ipe-bench estimate "a*exp(-b*t)+c" my.csv, or choose measurement=NAME',
+    ),
+    "a file without a model for run": (
+        ["run", "my.csv"],
+        "my.csv: holds readings, and no model is given; write a function's file, a formula in"
+        ' quotes or a YAML file before it: ipe-bench run "a*exp(-b*t)+c" my.csv',
+    ),
     "an option without its group": (
         ["run", "newton"],
         "newton: is not KEY=VALUE; write solver=[newton]",
@@ -324,6 +333,34 @@ SOME = [
     pytest.param(case, marks=() if i % 6 == 0 else pytest.mark.slow)
     for i, case in enumerate(MISTAKES)
 ]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("run a*t my.csv --dry-run", "--dry-run: has no meaning with a model and readings of your"),
+        ("run a*t my.csv -m seed=1,2", "-m: has no meaning with a model and readings of your own"),
+        ("run a*t my.csv seed=1,2", "seed=1,2: is a sweep, which only runs of simulated trials"),
+        ("estimate a*t my.csv error_scale=1,2", "error_scale=1,2: is a sweep, which only runs of"),
+        (
+            "design measurement=polynomial hydra.sweeper.params.error_scale='1,2'",
+            "hydra.sweeper.params.error_scale='1,2': is a sweep, which only runs of simulated",
+        ),
+    ],
+)
+def test_a_command_of_one_job_takes_no_sweep_and_advises_none(tmp_path, ipe_bench, words, expected):
+    (tmp_path / "my.csv").write_text("t,reading\n1,2\n2,3\n3,5\n4,8\n")
+    code, _, error = ipe_bench(*words.split())
+    assert (code, error.count("\n")) == (2, 1)
+    assert expected in error
+
+
+def test_the_help_of_list_names_groups_that_are_listed(ipe_bench):
+    _, helped, _ = ipe_bench("list", "--help")
+    named = re.search(r"^ +GROUP +(.*?);", helped, re.MULTILINE)[1]
+    groups = [word for word in re.findall(r"\w+", named) if word != "or"]
+    assert len(groups) > 1
+    assert ipe_bench("list", *groups)[0] == 0
 
 
 @pytest.mark.parametrize("case", SOME)
