@@ -21,6 +21,7 @@ from ipe_bench.real.estimation import nearer_starts
 from ipe_bench.real.examination import Examination
 from ipe_bench.report.page.answer import estimate_content
 from ipe_bench.solvers import Auto
+from ipe_bench.trials.thresholds import FIT_LEVEL
 
 T = np.linspace(0, 10, 41)
 
@@ -36,15 +37,18 @@ def test_of_two_minima_far_apart_the_worse_does_not_fit(noise):
     )
     w = [p.name for p in right.model.parameters].index("w")
     assert abs(wrong.x[w] - right.x[w]) > 20 * right.standard_errors[w]
-    assert wrong.fits is not False
+    assert noise.estimated or wrong.p_value > FIT_LEVEL
+    assert wrong.white_p > FIT_LEVEL
+    assert (wrong.beaten_by, wrong.fits, wrong.passes) == ("search", False, False)
+    assert right.passes
     answer = ib.estimate(
         far, z, {"lm": LevenbergMarquardt(), "auto": ib.solvers.Auto()}, noise=noise
     )
     assert answer["auto"].x == pytest.approx(right.x, rel=1e-4)
     assert (answer["auto"].passes, answer["lm"].passes) == (True, False)
     assert answer["lm"].beaten_by == "auto"
-    assert "lm: auto found a better fit" in str(answer)
-    assert "lm: auto found a better fit" in answer._repr_html_()
+    assert "lm: auto found a significantly better fit" in str(answer)
+    assert "lm: auto found a significantly better fit" in answer._repr_html_()
 
 
 def test_parameters_that_the_readings_do_not_tell_apart_are_named():

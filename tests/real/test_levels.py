@@ -243,7 +243,7 @@ def test_levels_stand_beside_the_parameters_of_every_estimator():
     )
     assert answer.table()["parameter"].tolist() == ["a", "k", "l", "sigma_0", "sigma_1"] * 2
     shown = str(answer)
-    assert "linear: takes the levels of its own residuals as known" in shown
+    assert "linear: treats its estimated noise levels as exact" in shown
     assert "the size of the residuals cannot test the model" in shown
     assert answer["lm"].fits is None
 
@@ -275,7 +275,7 @@ def test_estimates_with_a_prior_have_the_levels_of_their_residuals():
     )
     assert answer["map"].x == pytest.approx(answer["lm"].x, rel=1e-3)
     assert answer.examination.label == "lm"
-    assert "map: takes the levels of its own residuals as known" in str(answer)
+    assert "map: treats its estimated noise levels as exact" in str(answer)
 
 
 def test_a_column_of_standard_deviations_weighs_the_levels(tmp_path):
