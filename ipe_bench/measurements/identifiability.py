@@ -45,8 +45,7 @@ class Structure:
 
     unknowns: tuple[str, ...]
     groups: tuple[tuple[str, ...], ...]
-    """Groups of parameters that no readings tell, as they move together and leave every reading as
-    it is."""
+    """Groups of parameters that can change together without changing any reading."""
 
     @property
     def lost(self) -> tuple[str, ...]:
@@ -60,10 +59,10 @@ class Structure:
 
 def _sentence(group: Sequence[str]) -> str:
     if len(group) == 1:
-        return f"{group[0]} moves and leaves every reading as it is; fix it, or read another output"
+        return f"{group[0]} can change without changing any reading; fix it, or read another output"
     names = ", ".join(group)
     return (
-        f"{names} move together and leave every reading as it is;"
+        f"{names} can change together without changing any reading;"
         " fix one of them, or read another output"
     )
 

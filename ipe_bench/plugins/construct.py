@@ -104,7 +104,7 @@ def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
         types = option_types(cls)
         options = {name: checked(value, types[name], name) for name, value in options.items()}
         if required:
-            raise UserError(f"{required[0]}: is not given; give it a value")
+            raise UserError(f"{required[0]}: is required")
         return cls(**options)
     except UserError as error:
         # A class whose check is made later, too, names the whole key itself.

@@ -404,7 +404,7 @@ def _check_values(
             raise UserError(f"{key}.{label}: {unknown(label, labels, 'name')}")
     absent = set(labels) - set(given)
     if complete and absent:
-        raise UserError(f"{key}.{min(absent)}: is not given; give it a value")
+        raise UserError(f"{key}.{min(absent)}: is required")
 
 
 def _check_inputs(model: Formulas) -> None:

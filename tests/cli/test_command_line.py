@@ -705,7 +705,7 @@ def test_a_model_that_brings_its_own_certified_readings_has_a_table(ipe_bench):
     code, out, _ = ipe_bench("run", *words, "baseline=[gauss_newton]")
     assert code == 0
     assert "gauss_newton" in out
-    assert "no trial is stored" not in out
+    assert "no trials yet" not in out
 
 
 def test_the_list_names_our_statistics_and_figures_too(capsys):

@@ -95,7 +95,7 @@ def test_a_report_of_many_settings_takes_two_screens_and_names_what_is_left_out(
     # Each has a table of its two estimators at one scale.
     shown = 2 * titles
     left_out = (
-        f"{80 - shown} of 80 rows are left out here, {8 - titles} of 8 settings whole; summary.csv"
+        f"{80 - shown} of 80 rows are not shown here, {8 - titles} of 8 settings whole; summary.csv"
         " and"
     )
     assert any(line.startswith(left_out) for line in lines)

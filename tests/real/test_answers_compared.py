@@ -166,15 +166,15 @@ def answered(deviation, beyond=0.0, factor=1.0, seed=0):
     ("truth", "said"),
     [
         ({"deviation": 0.3}, "by lm, which passes every test"),
-        ({"deviation": None}, "by lm, the size of whose residuals is not tested"),
+        ({"deviation": None}, "by lm, fit not tested because the noise is unknown"),
         ({"deviation": 0.3, "factor": 3.0}, "no estimate both converged and fits"),
         (
             {"deviation": 0.45, "beyond": CURVED},
-            "by lm, in doubt, for successive residuals resemble each other",
+            "by lm, in doubt, because successive residuals resemble each other",
         ),
         (
             {"deviation": None, "beyond": CURVED},
-            "by lm, in doubt, for successive residuals resemble each other",
+            "by lm, in doubt, because successive residuals resemble each other",
         ),
         (
             {"deviation": 30.0},
@@ -223,7 +223,7 @@ def test_a_title_names_what_readings_leave_open_and_other_answers():
         "the readings do not determine a - b"
     )
     title = ib.estimate(square, z, lm, noise=Gaussian(0.3)).finding()
-    assert title.endswith("which passes every test, though other parameters fit as well")
+    assert title.endswith("which passes every test, but other parameters fit equally well")
 
 
 @pytest.mark.slow
@@ -318,7 +318,7 @@ def test_an_estimate_at_which_the_model_has_no_readings_is_in_brackets():
         )
         assert not answer["bad"].passes
         assert answer["bad"].fits is False
-        assert "bad: the model has no finite readings at this estimate" in str(answer)
+        assert "bad: the model is not finite at this estimate" in str(answer)
         assert answer["lm"].message == ""
         assert "(2)" in str(answer)
 

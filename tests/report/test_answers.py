@@ -279,7 +279,7 @@ def test_each_change_is_worded_beside_its_margin_and_filled_if_it_is_beyond(tmp_
     low, high = (
         100 * (frame.set_index("quantity").loc["error", end] - 1) for end in ("low", "high")
     )
-    assert said["error"] == [f"perhaps within the margin: {low:+.2g} to {high:+.2g} %"]
+    assert said["error"] == [f"significant, possibly negligible: {low:+.2g} to {high:+.2g} %"]
     assert said["cost"][0].startswith("worse: +")
     for ax, (low, high) in zip(
         axes.values(), ((-1.0, 1.0), (1 / 1.02, 1.02), (1 / 1.05, 1.05)), strict=True

@@ -392,7 +392,7 @@ def test_certified_readings_of_no_collection_are_found_too_and_an_empty_folder_i
     tmp_path, synthetic
 ):
     make_folder(tmp_path / "empty" / "runs")
-    assert said(tmp_path / "empty") == ["No trial is stored yet, so there is no finding."]
+    assert said(tmp_path / "empty") == ["No trials yet."]
     scenario = Scenario(Measured(), Certified())
     synthetic.bound = lambda scenario: np.full(3, 0.1)  # type: ignore[method-assign]
     synthetic.add(scenario, "newton", np.zeros((1, 3)))

@@ -159,7 +159,7 @@ def test_survivors_are_shown_as_survivors(synthetic):
 def test_nothing_stored_gives_a_page_that_says_so(tmp_path):
     (tmp_path / "runs").mkdir()
     result = write_report([tmp_path], tmp_path / "out")
-    assert "No trial is stored yet" in result.report.read_text(encoding="utf-8")
+    assert "No trials yet" in result.report.read_text(encoding="utf-8")
     assert result.figures == ()
     assert len(result.problems) == 1
 
@@ -330,7 +330,9 @@ def test_what_a_terminal_has_no_room_for_is_named_with_its_file_or_goes_below():
         *(texts(f"value {i}", ["1234567890"] * 3) for i in range(9)),
     ]
     left = shown_at(60, replace(Table("t", "T", "", columns), grouped=1, whole="all.csv"))
-    named = re.search(r"Too narrow for: (.*); all.csv has them.", " ".join(left))[1].split(", ")
+    named = re.search(r"Not shown for lack of width: (.*); see all.csv.", " ".join(left))[1].split(
+        ", "
+    )
     head = next(line for line in left if "estimator" in line)
     assert re.findall(r"value \d", head) + named == [f"value {i}" for i in range(9)]
     assert sum(line.split()[:1] == ["one"] for line in left) == 1  # once a group

@@ -30,6 +30,16 @@ FORBIDDEN = {
     r"(?:^|[.:;] )No (choice|data|rivals?) ": "no negation as subject",
 }
 """What a reader stumbles over, with what to write."""
+RETIRED = dict(
+    line.split("\t")
+    for line in Path(__file__).with_name("retired_words.tsv").read_text("utf-8").splitlines()
+)
+"""Phrases that must not come back, with what replaced them; {} is what is filled in."""
+
+
+def retired(text: str) -> list[str]:
+    """Returns the retired phrases of a text, in which {} is what is filled in."""
+    return [f"{phrase}: {better}" for phrase, better in RETIRED.items() if phrase in text]
 
 
 def stumbles(text: str) -> list[str]:
@@ -57,10 +67,11 @@ def strings(module: ast.Module) -> Iterator[ast.expr]:
             yield node
 
 
-def said(node: ast.expr) -> str:
+def said(node: ast.expr, filled: str = "X") -> str:
+    """Returns the text of a string, with a word for what is filled in."""
     if isinstance(node, ast.JoinedStr):
         return "".join(
-            str(part.value) if isinstance(part, ast.Constant) else "X" for part in node.values
+            str(part.value) if isinstance(part, ast.Constant) else filled for part in node.values
         )
     return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
 
@@ -94,6 +105,31 @@ def test_pages_and_configs_are_plain(page):
     if page.suffix == ".yaml":
         lines = [line.partition("#")[2] for line in lines]
     assert stumbles("\n".join(lines)) == []
+
+
+@pytest.mark.parametrize("folder", ["ipe_bench", "conf", "plugins"])
+def test_retired_phrases_do_not_come_back(folder):
+    """In strings of modules, in pages and in configs."""
+    read = {
+        path: path.read_text(encoding="utf-8")
+        for path in (ROOT / folder).rglob("*.*")
+        if path.suffix in (".py", ".md", ".yaml", ".j2")
+    }
+    written = {
+        path: "\n".join(said(node, "{}") for node in strings(ast.parse(text)))
+        if path.suffix == ".py"
+        else " ".join(text.split())
+        for path, text in read.items()
+    }
+    found = {path: wrong for path, text in written.items() if (wrong := retired(text))}
+    assert not found
+
+
+@pytest.mark.parametrize("phrase", RETIRED)
+def test_a_retired_phrase_is_found_where_it_stands(phrase):
+    joined = ast.parse(f"f{phrase.replace('{}', '{x}')!r}").body[0]
+    assert isinstance(joined, ast.Expr)
+    assert retired(said(joined.value, "{}"))
 
 
 @pytest.mark.parametrize(

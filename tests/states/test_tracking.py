@@ -447,10 +447,10 @@ WALK = {
             r"next\.x: two of states, noise, constants, inputs, k and t have",
         ),
         ({"readings": {"z": "x + w"}}, r"readings\.z: w: there is no such name"),
-        ({"spread": {"x": 1.0}}, r"spread\.v: is not given"),
+        ({"spread": {"x": 1.0}}, r"spread\.v: is required"),
         (
             {"readings": {"z": "x", "y": "v"}, "deviation": {"z": "1 + x**2"}},
-            r"deviation\.y: is not given; give it a value",
+            r"deviation\.y: is required",
         ),
         ({"deviation": {"z": -1.0}}, r"deviation\.z=-1\.0: give a number from 0 up"),
     ],

@@ -132,7 +132,7 @@ def _outcome(row: Any, low: float, high: float, measure: _Measure) -> str:
     extent = _extent(low, high, measure)
     if row["finding"]:
         return f"{row['finding']}: {extent}"
-    return f"perhaps within the margin: {extent}" if row["different"] else "undecided"
+    return f"significant, possibly negligible: {extent}" if row["different"] else "undecided"
 
 
 def _extent(low: float, high: float, measure: _Measure) -> str:

@@ -206,16 +206,16 @@ class Answer(Labelled[Fit]):
         if one.exact:
             found.append("which meets every reading exactly")
         elif _resembling(one):
-            found.append("in doubt, for successive residuals resemble each other")
+            found.append("in doubt, because successive residuals resemble each other")
         elif one.fits:
             found.append("which passes every test")
         else:
-            found.append("the size of whose residuals is not tested")
+            found.append("fit not tested because the noise is unknown")
         told = self.examination
         if told and told.overstated:
             found.append("though the stated noise is too large")
         elif told and told.ambiguous:
-            found.append("though other parameters fit as well")
+            found.append("but other parameters fit equally well")
         return ", ".join(found)
 
     @property

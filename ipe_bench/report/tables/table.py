@@ -272,7 +272,7 @@ def _pieces(table: Table, width: int) -> Iterator[Any]:
             break
         if table.whole:
             hidden = ", ".join(column.title for column in rest)
-            notes.insert(0, f"Too narrow for: {hidden}; {table.whole} has them.")
+            notes.insert(0, f"Not shown for lack of width: {hidden}; see {table.whole}.")
             break
     for note in filter(None, notes):
         yield Text(note, style="dim")

@@ -120,10 +120,10 @@ def summary_tables(
         hidden = len(settings) - len(kept)
         whole = f", {hidden} of {len(settings)} settings whole" if hidden else ""
         parts.append(
-            f"{further} of {len(rows)} rows are left out here{whole}; summary.csv and report.html"
+            f"{further} of {len(rows)} rows are not shown here{whole}; summary.csv and report.html"
             " have all."
         )
-    return parts or ["no trial is stored yet"]
+    return parts or ["no trials yet"]
 
 
 def _columns_of_settings(rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -114,8 +114,8 @@ class Dask(Processes):
 
 def _lost(client: Any) -> StorageError:
     return StorageError(
-        f"execution=dask: the scheduler at {client.scheduler.address} is gone; what was computed"
-        " is kept, and the same command goes on from there"
+        f"execution=dask: the scheduler at {client.scheduler.address} is gone; results are kept;"
+        " run the same command to resume"
     )
 
 

@@ -87,7 +87,7 @@ def test_the_terminal_and_the_report_show_them(folder):
         console.print(terminal(list(SECTION.write(analyse([folder]))), 140))
         shown = console.export_text()
     assert "Known minima" in shown
-    assert "no trial is stored" not in shown
+    assert "no trials yet" not in shown
     result = write_report([folder], folder, figures="all")
     assert {p.name for p in result.tables} >= {"attained.csv", "attained_problems.csv"}
     assert [p.name for p in result.figures] == ["data_profile.png"]
