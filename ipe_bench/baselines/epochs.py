@@ -114,7 +114,7 @@ def _require_uncorrelated(R: Covariance, rows: Rows) -> None:
 class Walk(ABC):
     """Leads a batch of filters through the epochs: a subclass says how they take one in.
 
-    States are distances from the nominal point in prior deviations, and readings are whitened (R =
+    States are distances from the start in prior deviations, and readings are whitened (R =
     I), so that P starts near the unit matrix for any units of the parameters.
     """
 

@@ -41,7 +41,7 @@ instead."""
 
 @dataclass(frozen=True)
 class Belief:
-    """Holds N(mean, (U'U)^-1) for each trial, in prior deviations from the nominal point."""
+    """Holds N(mean, (U'U)^-1) for each trial, in prior deviations from the start."""
 
     mean: Array
     """(trials, n)."""
@@ -78,7 +78,7 @@ class EpochReadings:
     """Holds the readings z (trials, m) of an epoch, for the trials `rows`, and the belief before
     them.
 
-    x is in prior deviations from the nominal point.
+    x is in prior deviations from the start.
     """
 
     epoch: Epoch

@@ -80,8 +80,8 @@ class Batch(Estimator):
     """Minimises least squares iteratively; a subclass states the objective and the method."""
 
     start: Start = "nominal"
-    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or the one of the two
-    where the readings fit better (`best`)."""
+    """Where the iteration begins: at the linear LSE, eq. (16), at the model's start (`nominal`),
+    or at the one of the two where the readings fit better (`best`)."""
     max_iterations: Count = 100
     """Steps tried."""
     tolerance: Positive = 1e-6
@@ -193,7 +193,7 @@ class MapLM(Batch):
 
 @dataclass(frozen=True)
 class MultiscaleLM(Estimator):
-    """Minimises least squares for hard starts: twice from the nominal point, keeping the lower
+    """Minimises least squares where it is hard to begin: twice from the start, keeping the lower
     minimum.
 
     Marquardt's scaling (column norms of J, growing) may run along a parameter that the readings
@@ -236,14 +236,14 @@ class MultiscaleLM(Estimator):
 
 @dataclass(frozen=True)
 class Multistart(Estimator):
-    """Runs Levenberg-Marquardt from the nominal point, then from draws of the prior, until the
+    """Runs Levenberg-Marquardt from the start, then from draws of the prior, until the
     residuals pass the chi-square test; of all minima the lowest counts (Boender and Rinnooy Kan,
     Mathematical Programming 37, 1987).
 
     After the first fit `confirmations` further starts look for another minimum that fits. Extras:
     `minima`, how many distinct minima that fit were found, and `ambiguous`, 1 where there are
     several; `alternatives` lists the others. Damping is in the metric of the prior. Without a prior
-    it is in Marquardt's, and starts are spread by the size of the nominal point.
+    it is in Marquardt's, and the draws are spread by the size of the start.
 
     Example:
 
@@ -323,8 +323,8 @@ class LeastSquares(Estimator):
     method: Literal["trf", "lm", "dogbox"] = "trf"
     """Trust region, MINPACK's Levenberg-Marquardt, or dogleg."""
     start: Start = "best"
-    """The linear LSE, eq. (16), the nominal point, or the one of the two where the readings fit
-    better (`best`)."""
+    """Where the iteration begins: at the linear LSE, eq. (16), at the model's start (`nominal`),
+    or at the one of the two where the readings fit better (`best`)."""
     loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
     """Anything but linear bounds what one bad reading can do; `lm` knows linear only."""
     f_scale: Positive = 1.0

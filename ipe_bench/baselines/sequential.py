@@ -27,7 +27,7 @@ LARGEST = 1e150
 
 
 class ConstantFilter(ABC):
-    """Filters one trial. The state x is the parameters' distance from the nominal point in prior
+    """Filters one trial. The state x is the parameters' distance from the start in prior
     deviations, and the readings are whitened (R = I).
 
     Required: `x`, `P`, `predict`, `points` and `update`. Optional: `nis`, to which `update` adds.

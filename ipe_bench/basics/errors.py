@@ -112,10 +112,14 @@ ZOO = {
     "triad": "Triad",
 }
 """Options and classes that earlier versions had and the plugin zoo has now."""
+RENAMED = {"gins_tilted": "gins_platform_misaligned", "iekf": "iterated_ekf"}
+"""Options of earlier versions, and their names now."""
 
 
 def moved(name: str) -> str:
     """Says where an option or a class of an earlier version is now; empty if it has not moved."""
+    if name in RENAMED:
+        return f"is {RENAMED[name]} now"
     if name not in (*ZOO, *ZOO.values()):
         return ""
     what = "" if name in ZOO else f"ipe_bench_zoo.{name} "

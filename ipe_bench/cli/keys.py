@@ -29,7 +29,7 @@ _ROWS = (
         "the measurement model; `ipe-bench list measurement` shows which there are",
     ),
     ("still", "noise=NAME", "the errors of the readings"),
-    ("still", "prior=NAME", "the distribution of the true parameters about the nominal point"),
+    ("still", "prior=NAME", "the distribution of the true parameters about the start"),
     ("estimators", "solver=[A,B]", "iterative solvers of the estimating equation"),
     ("estimators", "baseline=[A,B]", "other estimators, on the same trials"),
     ("moving", "state_model=NAME", "a model of moving states, instead of a measurement model"),

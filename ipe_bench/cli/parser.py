@@ -145,7 +145,7 @@ find=[A,B]          find constants, noises or readings of state_model= by
                     maximum likelihood.
 parameters.NAME.fixed=X, .lower=X, .upper=X
                     knowledge of a parameter; parameters=FILE.yaml: of many.
-error_scale=X       distance of parameters from the nominal point: the prior
+error_scale=X       distance of parameters from the start: the prior
                     of filters and map_lm.
 figures=none        omit the figures.
 output=DIR          folder of the files (outputs/estimate-MODEL, or

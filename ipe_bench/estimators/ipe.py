@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from ipe_bench.measurements.problem import Problem
 
 Start = Literal["linear_lse", "nominal", "best"]
-"""The start of an iteration: the linear LSE, eq. (16), the nominal point, or the better fit of the
-two."""
+"""Where an iteration begins: at the linear LSE, eq. (16), at the model's start, or at the better
+fit of the two."""
 _COARSE_BEYOND = 0.03
 """Size of F, in standard deviations of the linear bound, above which a coarse Jacobian is as good
 for a step."""
@@ -100,7 +100,7 @@ class FrozenSystem:
 
     @classmethod
     def at_nominal(cls, problem: Problem, z: Array) -> FrozenSystem:
-        """Builds the paper's system: H about the nominal point, for readings z (trials, m).
+        """Builds the paper's system: H about the start, for readings z (trials, m).
 
         Raises:
             LinAlgError: H has not full column rank.
@@ -108,8 +108,8 @@ class FrozenSystem:
         if problem.rankless:
             raise np.linalg.LinAlgError(
                 f"measurement={problem.measurement.name}: H has not full column rank at the"
-                " nominal point: some parameters cannot be distinguished there, so there is no"
-                " linear estimate to start from; give another nominal point, start=nominal or best"
+                " start: some parameters cannot be distinguished there, so there is no"
+                " linear estimate to start from; give another start, start=nominal or best"
                 " for least squares, or an estimator with a prior"
             )
         model = CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
@@ -181,8 +181,8 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
     """Returns the start x (trials, n) of an iteration, and the paper's system, which has counted
     the cost of it.
 
-    F(x0) = H+ (h(x0) - z), so the linear LSE of eq. (2) is one fixed-point step from the nominal
-    point: eq. (16).
+    F(x0) = H+ (h(x0) - z), so the linear LSE of eq. (2) is one fixed-point step from the
+    start: eq. (16).
     """
     system = FrozenSystem.at_nominal(problem, z)
     x0 = repeated(problem.x0, len(z))
@@ -198,8 +198,8 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
 
 
 def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationCount) -> Array:
-    """Returns the starts (trials, n) of least squares, at the nominal point if H has not full
-    column rank, and adds their cost to the tally."""
+    """Returns the points (trials, n) where least squares begins, the model's start if H has not
+    full column rank, and adds their cost to the tally."""
     if start == "nominal" or problem.rankless:
         return repeated(problem.x0, len(z))
     x, system = begin(problem, z, start)
@@ -210,7 +210,7 @@ def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationC
 
 @dataclass(frozen=True, kw_only=True)
 class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
-    r"""Solves eq. (11), H frozen at the nominal point, by an iteration that a subclass writes: the
+    r"""Solves eq. (11), H frozen at the start, by an iteration that a subclass writes: the
     paper's estimator.
 
     Required: `step`. Optional: `init`, of a solver with a memory, which names its state:
@@ -234,8 +234,8 @@ class IPE(Method[FrozenSystem, S], Estimator, Generic[S]):
     """
 
     start: Start = "linear_lse"
-    """Start of the iteration: the linear LSE, eq. (16), the nominal point, or the one of the two
-    where the readings fit better (`best`)."""
+    """Where the iteration begins: at the linear LSE, eq. (16), at the model's start (`nominal`),
+    or at the one of the two where the readings fit better (`best`)."""
     max_iterations: Count = 100
     """Steps at most, then the trial ends as `max_iterations`."""
     tolerance: Positive = 1e-6

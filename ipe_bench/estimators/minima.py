@@ -199,8 +199,8 @@ def passes(found: Minima, readings: int, significance: float) -> Mask:
 
 
 def spread_of_starts(problem: Problem) -> Array:
-    """Computes standard deviations (n,) of random starts about the nominal point: those of the
-    prior where one is known, else the size of the nominal point, or 1 where that is zero."""
+    """Computes standard deviations (n,) of random starts about the start: those of the
+    prior where one is known, else the size of the start, or 1 where that is zero."""
     if problem.prior_deviation is not None:
         return problem.prior_deviation
     return np.where(problem.x0 == 0, 1.0, np.abs(problem.x0))

@@ -291,7 +291,7 @@ class Measurement(Component, ABC):
     def _own_differences(self) -> Judged:
         try:
             return self._with_differences(self._tried_points)
-        except Exception:  # it may refuse what is not near the nominal point
+        except Exception:  # it may refuse what is not near the start
             return self._with_differences(self._tried_points[:1])
 
     def _with_differences(self, points: Array) -> Judged:
@@ -305,7 +305,7 @@ class Measurement(Component, ABC):
 
     def _require_analytic(self) -> None:
         """Raises UserError, at the first Jacobian, if complex steps do not find slopes that
-        differences find near the nominal point."""
+        differences find near the start."""
         if self._is_analytic:
             return
         raise UserError(
@@ -346,7 +346,7 @@ class Measurement(Component, ABC):
         return self.jacobian_cost
 
     def linearization(self) -> Array:
-        """Computes the matrix H (m, n) of eq. (1) about the nominal point."""
+        """Computes the matrix H (m, n) of eq. (1) about the start."""
         return self.jacobian(self.nominal[None])[0]
 
     def rows(self, stop: int) -> NDArray[np.intp]:

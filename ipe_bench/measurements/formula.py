@@ -214,7 +214,7 @@ class Formula(WrittenModel):
     expression: str
     """The formula of a reading, such as b1*(1-exp(-b2*t))."""
     start: Mapping[str, Finite] = field(default_factory=dict)
-    """Start of each parameter: the nominal point."""
+    """Start of each parameter."""
     columns: Mapping[str, Sequence[float]] = field(default_factory=dict)
     """Columns of the readings for `run`, which has no file."""
     readings: Count | None = None

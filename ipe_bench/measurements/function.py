@@ -51,8 +51,7 @@ class Function(WrittenModel):
     """The function: MODULE:NAME, where MODULE is importable or MODULE.py lies in the working
     folder."""
     start: Mapping[str, Finite] = field(default_factory=dict)
-    """Start of each parameter: the nominal point. An argument without a default becomes a
-    parameter."""
+    """Start of each parameter. An argument without a default becomes a parameter."""
     size: Mapping[str, Positive] = field(default_factory=dict)
     """The physical size of one unit of a parameter; otherwise the magnitude of its start, or 1
     where that is 0."""

@@ -311,12 +311,12 @@ class RicherGins(Gins):
     increment of deviation `gyro_random_walk` times the root of the interval, and the drift is
     constant within it.
 
-    Example, in which a tilt of the platform stays undetected:
+    Example, in which a misaligned platform stays undetected:
 
     >>> import ipe_bench as ib
     >>> plain = ib.measurements.Gins()
-    >>> tilted = ib.measurements.RicherGins(platform_misalignment=5.0)
-    >>> bench = ib.Scenario(plain, truth=tilted)
+    >>> misaligned = ib.measurements.RicherGins(platform_misalignment=5.0)
+    >>> bench = ib.Scenario(plain, truth=misaligned)
     >>> row = ib.run(bench, {"gn": ib.baselines.GaussNewton()}, trials=5).iloc[-1]
     >>> print(row["error_median"] > 10, row["misfit"])
     True 0.0
@@ -373,7 +373,7 @@ class RicherGins(Gins):
         return parameter_table(
             (("quadratic x", "quadratic y"), "micro-g/g^2", quadratic, "accelerometer quadratic"),
             (("misalignment xy", "misalignment yx"), "arcsec", angle, "accelerometer misalignment"),
-            (("tilt x", "tilt y", "tilt z"), "arcsec", angle, "platform tilt"),
+            (("platform x", "platform y", "platform z"), "arcsec", angle, "platform misalignment"),
             (walk, "deg/h", 1 / self._drift, "gyro random walk"),
         )
 

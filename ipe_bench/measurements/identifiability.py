@@ -82,7 +82,7 @@ def structure(model: Measurement) -> Structure | None:
 
     Returns None for other models, for formulas that are not examined (sin, tanh and their kin;
     conditionals; inputs or exponents that change with time; a denominator that is 0 at the start),
-    for models so large that it would take long, and where the readings at the nominal point
+    for models so large that it would take long, and where the readings at the start
     determine more than the coefficients that were examined.
     """
     fixed: dict[str, float] = {}
@@ -138,8 +138,8 @@ def _groups(basis: _Basis, unknowns: int) -> list[set[int]]:
 
 
 def _rank(model: Measurement) -> int:
-    """Computes how many parameters or combinations of them the readings determine at the nominal
-    point, at least."""
+    """Computes how many parameters or combinations of them the readings determine at the
+    start, at least."""
     if not model.input_columns_known:
         return 0
     x = model.nominal[None]

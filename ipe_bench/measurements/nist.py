@@ -117,7 +117,7 @@ class Nist(Measurement):
     """Holds one regression problem of NIST, to be started at one of its two certified starting
     points.
 
-    The nominal point is that start, and each parameter's size is its magnitude there, so x0
+    The start is that point, and each parameter's size is its magnitude there, so x0
     consists of ones and minus ones. There is no order of arrival and no prior. A reading is one
     observation y; for Nelson it is log(y), as NIST fits it.
 

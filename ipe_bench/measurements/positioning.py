@@ -49,7 +49,7 @@ class Ranging(Measurement):
     beacons: tuple[tuple[float, float, float], ...] = _BEACONS
     """East, north, up of each beacon in m."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """The presumed position of the receiver in m: the nominal point."""
+    """The presumed position of the receiver in m: the start."""
     rounds: Count = 3
 
     reading_unit = "m"
@@ -112,7 +112,7 @@ class Bearings(Measurement):
     interval: Positive = 60.0
     """Time between bearings in s; the first is taken at time 0."""
     target: tuple[float, float, float, float] = (3000.0, 5000.0, -3.0, 1.0)
-    """The presumed target (east and north in m, in m/s): the nominal point."""
+    """The presumed target (east and north in m, in m/s): the start."""
 
     reading_unit = "deg"
     usual_noise = UsualNoise(0.5)

@@ -31,7 +31,7 @@ class Problem:
     measurement: Measurement
     R: Covariance
     prior_deviation: Array | None = None
-    """Standard deviation (n,) of the parameters about the nominal point; None where no prior is
+    """Standard deviation (n,) of the parameters about the start; None where no prior is
     known."""
     prior_correlation: Array | None = None
     """Their correlation (n, n); None: they are independent."""
@@ -47,7 +47,7 @@ class Problem:
 
     @property
     def x0(self) -> Array:
-        """The nominal point (n,)."""
+        """The start (n,)."""
         return read_only(self.measurement.nominal)
 
     @cached_property
@@ -95,7 +95,7 @@ class Problem:
 
 
 def require_nominal(model: Measurement) -> None:
-    """Refuses a model whose nominal point is not (n,)."""
+    """Refuses a model whose start is not (n,)."""
     shape = np.shape(model.nominal)
     if shape != (model.n,):
         names = ", ".join(p.name for p in model.parameters)

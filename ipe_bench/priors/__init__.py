@@ -23,10 +23,10 @@ _DEFINITE = 1e-12
 
 
 class Prior(Component, ABC):
-    """Draws true parameters about the nominal point: a frozen dataclass of its options.
+    """Draws true parameters about the start: a frozen dataclass of its options.
 
     Required: `deviation` and `draw`. Optional: `correlation`, and `normal`. Promised: draws have
-    the nominal point as mean, and the covariance P0 of these deviations and correlations; they come
+    the start as mean, and the covariance P0 of these deviations and correlations; they come
     from `rng` alone. Estimators that use a prior are given N(nominal, P0), and the Bayesian bound
     is the one under that; if draws are not normal, it is one for estimators that know no more than
     mean and covariance.
@@ -59,7 +59,7 @@ class Prior(Component, ABC):
 
     @abstractmethod
     def draw(self, x0: Array, error_scale: float, rng: np.random.Generator) -> Array:
-        """Returns one parameter vector (n,) about the nominal point x0 (n,), in multiples of the
+        """Returns one parameter vector (n,) about the start x0 (n,), in multiples of the
         units."""
 
 

@@ -48,7 +48,7 @@ class Question:
 
     @property
     def has_prior(self) -> bool:
-        """Tells whether anything says how far the parameters may lie from the nominal point."""
+        """Tells whether anything says how far the parameters may lie from the start."""
         deviating = any(one.deviation is not None for one in self.known)
         return deviating or self.prior is not None or self.error_scale is not None
 

@@ -181,7 +181,7 @@ POOL = (
 )
 """Our others, of which each has its own place among the markers and dashes; a name from elsewhere
 has one by chance."""
-_ALIKE = {"iekf": "iterated_ekf", "ipe_fixed_point": "fixed_point", "ipe_newton": "newton"}
+_ALIKE = {"ipe_fixed_point": "fixed_point", "ipe_newton": "newton"}
 """Trackers under another name than the estimator of constants that does the same."""
 
 

@@ -244,12 +244,12 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
         still = [
             parameter.name for i, parameter in enumerate(model.parameters) if not H[:, i].any()
         ]
-        where = f"readings do not change with {', '.join(still)} at the nominal point"
+        where = f"readings do not change with {', '.join(still)} at the start"
         if not still:
-            where = "readings at the nominal point do not determine"
+            where = "readings at the start do not determine"
             where += f" {', '.join(_undetermined(scenario)) or 'all parameters'}"
         yield (
-            f"measurement={model.name}: {where}; choose another nominal point or further readings,"
+            f"measurement={model.name}: {where}; choose another start or further readings,"
             " or try `ipe-bench check` if the slopes are wrong"
         )
         return
@@ -262,7 +262,7 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
 
 
 def _undetermined(scenario: Scenario) -> list[str]:
-    """Names the parameters that readings at the nominal point leave open; none if H is not
+    """Names the parameters that readings at the start leave open; none if H is not
     finite."""
     H = scenario.problem.R.whiten_jacobian(scenario.problem.H)
     if not np.isfinite(H).all():

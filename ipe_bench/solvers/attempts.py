@@ -29,7 +29,7 @@ Rows = NDArray[np.intp]
 # fewer with half of `_LOOKS`, and the cost within 1 %: `python tests/benchmarks/constants.py
 # attempts`. Few of those trials need a further attempt. `_SLOW_GROWTH` and tuples were not varied.
 _LONG = 600
-"""Iterations of an attempt from the nominal point, and of one from elsewhere that promises
+"""Iterations of an attempt from the start, and of one from elsewhere that promises
 something."""
 _PROMISING = 1e-3
 """The share by which a fit that has not converged must be better than the best one so far to
@@ -74,10 +74,10 @@ class Attempts(ABC):
     @abstractmethod
     def draws(self, k: int) -> int:
         """Returns the number of independent draws that the k-th attempt begins from; 0 if it begins
-        at the nominal point or where the readings point."""
+        at the start or where the readings point."""
 
     def plain(self, k: int, rows: Rows) -> Minima:
-        """Runs Levenberg-Marquardt on all data from the nominal point: in the metric of the
+        """Runs Levenberg-Marquardt on all data from the start: in the metric of the
         parameters' sizes (0), and in Marquardt's (1)."""
         method = (LevenbergMarquardtMethod(1.0, sizes=1.0), LevenbergMarquardtMethod(1e-3))[k]
         x = repeated(self.problem.x0, len(rows))
@@ -126,7 +126,7 @@ _SHORT = 60
 _RAYS = np.array(
     [sign * 10.0**exponent for exponent in np.arange(-3, 1.01, 0.25) for sign in (1, -1)]
 )
-"""Multiples of the nominal point that are looked at as starts."""
+"""Multiples of the start that are looked at as points to begin from."""
 _APART = 0.6
 """Two starts on one ray are different where their sizes are, by this power of ten."""
 _LOOKS = 20
@@ -141,8 +141,8 @@ _HALVINGS = ((5, 5), (15, 2), (_SHORT, 1))
 
 @dataclass(frozen=True)
 class Stages(Attempts):
-    """Starts from the nominal point under two metrics; from the two best points on the ray through
-    the nominal point; then from the best of 20 random points, again and again."""
+    """Begins from the start under two metrics; from the two best points on the ray through
+    the start; then from the best of 20 random points, again and again."""
 
     planned = 16
     repeats = 3
@@ -189,9 +189,9 @@ class Stages(Attempts):
         return points[chosen]
 
     def _points(self, k: int, *, wide: bool = False) -> Array:
-        """Draws 20 random points (20, n): of any size in the quadrant of the nominal point or one
+        """Draws 20 random points (20, n): of any size in the quadrant of the start or one
         nearby (`wide`), which a prior that is too narrow does not hinder; else of the prior if one
-        is known, of any sign (k even), or about the nominal point."""
+        is known, of any sign (k even), or about the start."""
         x0 = self.problem.x0
         shape = (_LOOKS, len(x0))
         rng = generator(k)
@@ -257,7 +257,7 @@ later."""
 
 @dataclass(frozen=True)
 class Windows(Attempts):
-    """Follows growing windows of data: from the nominal point, then carefully from there, then from
+    """Follows growing windows of data: from the start, then carefully from there, then from
     16, 32, ... 256 draws of the prior; among them, where a prior is known after the first draws,
     Levenberg-Marquardt on all data.
 
@@ -271,7 +271,7 @@ class Windows(Attempts):
 
     def _place(self, k: int) -> tuple[int | None, int]:
         """Tells which of the two attempts on all data the k-th one is, if any, and its place among
-        those by windows: 0 and 1 are from the nominal point, later ones from draws."""
+        those by windows: 0 and 1 are from the start, later ones from draws."""
         first = 2 if self.prior is None else 3
         by_windows = k if k < first else k - 2
         if first <= k < first + 2:
@@ -353,7 +353,7 @@ class Windows(Attempts):
         return self._best(rows, owner, found)
 
     def _starts(self, k: int, rows: Rows, before: Minima | None) -> Array:
-        """Chooses the starts (candidates, n): the nominal point in the first two attempts, then
+        """Chooses the starts (candidates, n): the start in the first two attempts, then
         draws about it, trial by trial."""
         x0 = self.problem.x0
         n = len(x0)

@@ -42,7 +42,7 @@ PROGRESSIVE = 2
 class Auto(Estimator):
     """Finds the least-squares estimate, as cheaply as this problem allows.
 
-    First the paper's fixed-point iteration, with H frozen at the nominal point and Anderson's
+    First the paper's fixed-point iteration, with H frozen at the start and Anderson's
     acceleration, given up where it does not come nearer to a root; then Gauss-Newton steps with one
     Jacobian, that of the root which it has found, computed anew as long as its change would leave
     the answer more than some hundred tolerances from the minimum. Where that does not converge, or

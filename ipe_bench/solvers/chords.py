@@ -25,7 +25,7 @@ from ipe_bench.solvers.anderson import accelerated, push
 # Halved or doubled, each of these leaves 313 of 320 trials solved, and changes the cost by 2 % at
 # most, or as in parentheses: `python tests/benchmarks/constants.py chords`.
 _ITERATIONS = 25
-"""Steps with the Jacobian H of the nominal point; where more are needed, another way is cheaper."""
+"""Steps with the Jacobian H of the start; where more are needed, another way is cheaper."""
 _TRIED = 6
 """Steps from the linear estimate after which it shows whether they wander, as far from the root
 (+6 %, 0)."""
@@ -113,7 +113,7 @@ class OnChord:
 class Chord(Method[Objective, OnChord]):
     """Takes Gauss-Newton steps with the Jacobian of the start, and Anderson's acceleration.
 
-    With H, the Jacobian of the nominal point, these are the fixed-point steps of eq. (17).
+    With H, the Jacobian of the start, these are the fixed-point steps of eq. (17).
     """
 
     bent: float = np.inf
@@ -167,8 +167,8 @@ class Chord(Method[Objective, OnChord]):
 def by_chords(
     objective: Objective, H: Array, tolerance: float, budget: float | None, *, history: bool
 ) -> tuple[Minima, Mask]:
-    """Finds the least-squares minimum of each trial, H (m, n) being the Jacobian at the nominal
-    point, and where fixed-point iteration contracts well there, eq. (18). Trials that do not arrive
+    """Finds the least-squares minimum of each trial, H (m, n) being the Jacobian at the
+    start, and where fixed-point iteration contracts well there, eq. (18). Trials that do not arrive
     have not converged."""
     trials = len(objective.rows)
     x0 = repeated(objective.x0, trials)

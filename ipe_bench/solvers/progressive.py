@@ -46,7 +46,7 @@ class Progressive(Estimator):
     prior_deviation|^2. The last pass, on all data, is plain least squares.
 
     The test of the residuals is the estimator's own verdict, extras `fit_p`. A trial that fails it,
-    and whose bulk of residuals is large too, is tried again: carefully from the nominal point
+    and whose bulk of residuals is large too, is tried again: carefully from the start
     (windows that grow slowly, damping by the residual, steps bent along the curvature), by
     Levenberg-Marquardt on all data, and from 16, 32, ... draws of the prior, which the first
     windows keep apart and the later ones thin out to those that fit best. The best fit counts. A

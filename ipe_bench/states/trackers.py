@@ -216,7 +216,7 @@ class Filter(Tracker):
 
     >>> import ipe_bench as ib
     >>> model = ib.component("state_model/pendulum", count=20, spread={"angle": 0.3, "rate": 0.3})
-    >>> trackers = {"iekf": ib.states.Filter(rule=ib.states.Taylor(), iterations=5)}
+    >>> trackers = {"iterated_ekf": ib.states.Filter(rule=ib.states.Taylor(), iterations=5)}
     >>> table = ib.run(model, trackers, trials=20)
     >>> float(table.iloc[-1]["success"])
     1.0

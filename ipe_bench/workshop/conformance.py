@@ -405,7 +405,7 @@ def _with_columns(model: Measurement) -> Measurement | None:
 
 
 def _points(model: Measurement) -> Array:
-    """Returns points a tenth of a unit around the nominal point, where every model makes sense."""
+    """Returns points a tenth of a unit around the start, where every model makes sense."""
     deviates = np.random.default_rng(11).standard_normal((4, model.n))
     x = model.nominal + 0.1 * deviates
     x.flags.writeable = False
@@ -432,7 +432,7 @@ def simulates_batches(model: Measurement) -> None:
     x = _points(model)
     z = model.simulate(x)
     _shaped("what simulate returns", z, (len(x), model.m))
-    assert np.isfinite(z).all(), "a reading near the nominal point is not finite"
+    assert np.isfinite(z).all(), "a reading near the start is not finite"
     for i in range(len(x)):
         alone = model.simulate(x[i : i + 1])[0]
         assert np.array_equal(alone, z[i]), (

@@ -360,7 +360,7 @@ ELSEWHERE = {
         "noise=unknown: the level",
         "noise=unknown: the {} readings",
         "measurement={}: H has not",
-        "measurement={}: {}; choose another nominal point",
+        "measurement={}: {}; choose another start",
     ),
     "of stored results": (
         "at={}: no estimate there passes",

@@ -48,11 +48,11 @@ def test_every_richer_version_of_the_model_is_suspected(ipe_bench):
     )
     assert code == 0
     rows = {line.strip().split("  ")[0]: line for line in out.splitlines()}
-    for name in ("tilt x", "tilt y", "gyro random walk", "misalignment xy", "quadratic x"):
+    for name in ("platform x", "platform y", "gyro random walk", "misalignment xy", "quadratic x"):
         assert name in rows
-    assert "yes" in rows["tilt y"]
-    assert "tilt y + 0.97 bx" in rows["tilt y"]
-    assert "Tests of residuals will not detect tilt y, tilt x, tilt z" in out
+    assert "yes" in rows["platform y"]
+    assert "platform y + 0.97 bx" in rows["platform y"]
+    assert "Tests of residuals will not detect platform y, platform x, platform z" in out
 
 
 def test_a_table_and_files_for_each_trial(ipe_bench, tmp_path):

@@ -89,7 +89,7 @@ NAMES = {
     "solver=[newton,fixed_point] baseline=[ekf]": "gins-newton+fixed_point-ekf",
     "solver=[] baseline=[ekf]": "gins-no_solver-ekf",
     "measurement=nist/misra1a noise=certified": "nist-misra1a-certified",
-    "truth_measurement=gins_tilted": "gins-truth=gins_tilted",
+    "truth_measurement=gins_platform_misaligned": "gins-truth=gins_platform_misaligned",
     "estimators.fixed_point.tolerance=1e-9": "gins-fixed_point.tolerance=1e-9",
     "+solver@estimators.n2=newton": "gins-n2=newton",
     "+experiment=paper": "paper",

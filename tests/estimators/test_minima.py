@@ -88,7 +88,7 @@ def test_minima_a_tenth_of_a_deviation_apart_are_two(by, known):
 
 @dataclass(frozen=True)
 class Coarse(Bent):
-    """Has Jacobians for a fifth of the cost, and no others but at the nominal point."""
+    """Has Jacobians for a fifth of the cost, and no others but at the start."""
 
     coarse_jacobian_cost = 0.6  # type: ignore[assignment]
 

@@ -183,7 +183,7 @@ def test_a_model_of_another_shape_is_refused_with_the_place_where_it_is_written(
 
 
 def test_readings_that_do_not_change_are_told_of_the_model_and_not_of_the_noise():
-    expected = "^measurement=wrong: readings do not change with c0, c1, c2, c3 at the nominal point"
+    expected = "^measurement=wrong: readings do not change with c0, c1, c2, c3 at the start"
     with pytest.raises(UserError, match=expected):
         validate([Scenario(Wrong(does="constant"), Gaussian(0.1))], LM, 10)
 
@@ -192,7 +192,7 @@ def test_readings_that_do_not_change_are_told_of_the_model_and_not_of_the_noise(
     ("times", "complaint"),
     [
         ((1.0, 2.0), "2 readings are too few for 3 parameters; take more"),
-        ((1.0, 2.0, 3.0), "readings at the nominal point do not determine a, b; choose another"),
+        ((1.0, 2.0, 3.0), "readings at the start do not determine a, b; choose another"),
     ],
 )
 def test_readings_that_leave_parameters_open_are_told_of_with_their_names(times, complaint):

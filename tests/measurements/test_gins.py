@@ -378,13 +378,13 @@ def test_nuisances_do_not_scale_with_the_errors():
 
 
 def test_who_is_noticed():
-    """Drifts that walk leave residuals; an initial tilt looks like a bias and leaves none, however
-    wrong the bias."""
+    """Drifts that walk leave residuals; a misaligned platform looks like a bias and leaves none,
+    however wrong the bias."""
     found = {}
     for name, errors in {
         "none": {},
         "walk": {"gyro_random_walk": 0.001},
-        "tilt": {"platform_misalignment": 5.0},
+        "platform": {"platform_misalignment": 5.0},
     }.items():
         given = scenario(**errors)
         trials = given.draw(0, 60)
@@ -396,8 +396,8 @@ def test_who_is_noticed():
     assert found["none"][1] < 0.05
     assert found["walk"][0] > 5
     assert found["walk"][1] > 0.95
-    assert found["tilt"][0] > 30
-    assert found["tilt"][1] < 0.1
+    assert found["platform"][0] > 30
+    assert found["platform"][1] < 0.1
 
 
 def test_a_truth_of_another_model_is_refused():

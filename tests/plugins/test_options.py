@@ -190,11 +190,11 @@ PRESETS = {
     ("measurement", "gins_misaligned"): {"accelerometer_misalignment", "platform_misalignment"},
     ("measurement", "gins_nonlinear"): {"accelerometer_quadratic"},
     ("measurement", "gins_random_walk"): {"gyro_random_walk"},
-    ("measurement", "gins_tilted"): {"platform_misalignment"},
+    ("measurement", "gins_platform_misaligned"): {"platform_misalignment"},
     # The filters and smoothers are rules and numbers of iterations.
     **{("tracker", name): {"rule"} for name in ("ukf", "ckf", "ghkf")},
     ("tracker", "ipe_newton"): {"method"},
-    ("tracker", "iekf"): {"iterations"},
+    ("tracker", "iterated_ekf"): {"iterations"},
     ("tracker", "iplf"): {"rule", "iterations"},
     ("tracker", "ukf_rts"): {"filter"},
     ("tracker", "ieks"): {"first"},

@@ -358,7 +358,8 @@ def test_a_name_has_one_look_whichever_others_are_there_and_its_family_the_hue()
     assert together["mine"].color in FAMILIES["IPE"]
     assert together["newton (gain=2)"].color == FACES["newton"].color
     assert together["newton (gain=2)"] != FACES["newton"]
-    assert looks(["iekf"], {"iekf": "filters"})["iekf"] == together["iterated_ekf"]
+    moving = {"ipe_newton": "whole"}
+    assert looks(list(moving), moving)["ipe_newton"] == together["newton"]
     assert looks(["mine"], kinds, own={"mine": ("#c51b7d", "s")})["mine"].line["color"] == "#c51b7d"
 
 

@@ -53,7 +53,7 @@ def test_an_experiment_contains_the_strongest_of_each_family(path):
     if path.stem in APART:
         return
     if path.stem == "states":
-        assert compared(path) >= {*strongest("states", "given").values(), "iplf", "iekf"}
+        assert compared(path) >= {*strongest("states", "given").values(), "iplf", "iterated_ekf"}
         return
     best = strongest("beyond", "family")
     assert set(best) >= {"IPE", "least squares", "filters"}

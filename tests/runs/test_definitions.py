@@ -406,7 +406,7 @@ def test_what_is_asked_of_a_model_after_an_edit_is_answered_by_its_functions_as_
     after = found()
     assert before[0] == pytest.approx(0.5)
     assert after[:2] == pytest.approx([before[0] / 2, before[1] / 2])
-    # The slope at the nominal point, and not at the estimate.
+    # The slope at the start, and not at the estimate.
     exact = model.times * 2 * np.exp(-model.times) / 0.01 * 0.1
     assert after[2] == pytest.approx(np.linalg.norm(exact), rel=1e-4)
 

@@ -80,7 +80,7 @@ def check_bits(estimator: Estimator, scenario: Scenario, trials: int) -> None:
 
 
 class Raising(Bent):
-    """Raises far from the nominal point."""
+    """Raises far from the start."""
 
     def simulate(self, x: Array) -> Array:
         if (np.abs(np.real(x[:, 0])) > 200).any():

@@ -55,7 +55,7 @@ class Linear(Measurement):
 
 
 class LinearGins(Gins):
-    """The GINS model's slopes at the nominal point in place of the model."""
+    """The GINS model's slopes at the start in place of the model."""
 
     name = "linear_gins"
 

@@ -50,7 +50,7 @@ class Written(Measurement):
     unknowns: int = 1
     count: int = 2
     first: float = 0.0
-    """The first parameter at the nominal point; the others are 0 there."""
+    """The first parameter at the start; the others are 0 there."""
     analytic = True
 
     def __post_init__(self) -> None:

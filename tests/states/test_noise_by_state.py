@@ -223,7 +223,7 @@ def test_a_model_by_formulas_is_the_one_in_python():
         )
         np.testing.assert_allclose(written.R_at(x, k), ROVER.R_at(x, k), rtol=1e-14)
     z = ROVER.draw(0, 2).z
-    for label in ("iekf", "ckf_rts", "bootstrap"):
+    for label in ("iterated_ekf", "ckf_rts", "bootstrap"):
         tracker = Smoother(TRACKERS["ckf"]) if label == "ckf_rts" else TRACKERS[label]
         means = [tracker.track(model, z).mean for model in (ROVER, written)]
         np.testing.assert_allclose(means[1], means[0], atol=1e-9)

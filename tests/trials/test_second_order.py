@@ -119,7 +119,7 @@ RICHER = {
     "quadratic": {"accelerometer_quadratic": 500.0},
     "walk": {"gyro_random_walk": 0.001},
     "misaligned": {"accelerometer_misalignment": 20.0, "platform_misalignment": 20.0},
-    "tilted": {"platform_misalignment": 5.0},
+    "platform": {"platform_misalignment": 5.0},
 }
 
 

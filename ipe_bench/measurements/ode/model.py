@@ -347,8 +347,8 @@ class OdeMeasurement(Measurement):
 
     def _in_doubt(self, states: Array) -> Mask:
         """Selects the trials of states (trials, cases, states + 1, times + 1) in which a step was
-        in doubt, or one that the rates divide by is negative though it never is at the nominal
-        point."""
+        in doubt, or one that the rates divide by is negative though it never is at the
+        start."""
         lowest = states[:, :, :-1].min(axis=(1, 3), initial=np.inf)
         below = (lowest < 0.0) & self._positive
         # The row behind the states counts, at the last time, the steps in doubt.
@@ -377,8 +377,8 @@ class OdeMeasurement(Measurement):
 
     def _told(self, x: Array, stop: int) -> Array:
         """Computes readings at the first `stop` times by the implicit method; not numbers from
-        where on outputs magnify what its steps leave of the states, nor anywhere if at the nominal
-        point other steps lead to other readings."""
+        where on outputs magnify what its steps leave of the states, nor anywhere if at the
+        start other steps lead to other readings."""
         return self._judged(*self._implicit.with_reach(x, stop), stop)
 
     def _judged(self, z: Array, reach: Array, stop: int) -> Array:
@@ -435,7 +435,7 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _nominal(self) -> ladder.Found:
-        """The rung of the nominal point: with steps that are short enough to meet what the shortest
+        """The rung of the start: with steps that are short enough to meet what the shortest
         meet."""
         x = own(self.nominal[None])
         told = np.isfinite(self._finest).all()
@@ -572,7 +572,7 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _coarseness(self) -> ladder.Coarseness:
-        """How much longer the steps of tangents may be, as measured at the nominal point."""
+        """How much longer the steps of tangents may be, as measured at the start."""
         x = own(self.nominal[None])
         stop = len(self.times)
         rung = self._nominal_rung
@@ -603,7 +603,7 @@ class OdeMeasurement(Measurement):
 
     @property
     def _nominal_rung(self) -> int:
-        """The rung of the nominal point, as its readings have it."""
+        """The rung of the start, as its readings have it."""
         places = self._rungs_of(own(self.nominal[None]), self._zeros).places
         return int(self._rungs[places[0]])
 

@@ -16,7 +16,7 @@ _MORE = """
                                                  about your estimate
   ipe-bench design measurement=ranging error_scale=10
   ipe-bench design measurement=gins by=time          other times, equal cases
-  ipe-bench design measurement=gins truth_measurement=gins_tilted
+  ipe-bench design measurement=gins truth_measurement=gins_platform_misaligned
 
 The analysis uses the model's Jacobians at its start, and at true parameters
 drawn from the prior, without noise. Unmodelled errors come from

@@ -186,7 +186,7 @@ def _minute(started: str) -> str:
 DEFINITIONS: dict[str, str] = {
     "trial": "One draw of true parameters and of noise. Trial t is the same for every estimator.",
     "error scale": (
-        "Standard deviation of the true parameters about the nominal point, in multiples of their"
+        "Standard deviation of the true parameters about the start, in multiples of their"
         " sizes (the magnitude of the start of a function's or a formula's parameter)."
     ),
     **{record.title: record.definition for record in STATISTICS},

@@ -6,7 +6,7 @@ The inertial system of the paper runs its four cases one after another on one pl
 three gyro drifts walk meanwhile (`state_model=walking_gins`). Scored are the eight parameters that
 stand still, over all trials, in multiples of the error that a filter linearised at the truth has.
 Least squares and iterated estimation take drifts for constants; modelled, the walk is in the
-correlated errors of the readings, linearised at the nominal point. The filters are extended Kalman
+correlated errors of the readings, linearised at the start. The filters are extended Kalman
 filters with and without the walk.
 """
 
@@ -42,7 +42,7 @@ STYLES = {
 
 def errors_by_walk(model: WalkingGins) -> np.ndarray:
     """Covariance (m, m) of the readings by drifts that walk by one size in an hour, linearised at
-    the nominal point."""
+    the start."""
     x = model.prior.mean
     S = np.zeros((model.n, 3 * model.epochs))
     rows = []

@@ -42,8 +42,8 @@ class Optimistix(Estimator):
 
     method: Literal["levenberg_marquardt", "dogleg", "gauss_newton"] = "levenberg_marquardt"
     start: Start = "nominal"
-    """The nominal point, the linear LSE, or that of the two where the readings fit better
-    (`best`)."""
+    """Where the iteration begins: at the start, at the linear LSE, or at that of the two where the
+    readings fit better (`best`)."""
     rtol: Positive = 1e-10
     """Relative change of x and of the residuals at which the search ends."""
     atol: Positive = 1e-10

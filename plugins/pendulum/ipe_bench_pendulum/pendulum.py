@@ -28,7 +28,7 @@ class Pendulum(OdeMeasurement):
     """
 
     length: Positive = 1.0
-    """Presumed, in m; with the three that follow, the nominal point."""
+    """Presumed, in m; with the three that follow, the start."""
     damping: Finite = 0.02
     """Presumed, in 1/s."""
     angle: Finite = 1.2

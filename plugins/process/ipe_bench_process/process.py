@@ -87,7 +87,7 @@ class Process(Estimator):
         return hashlib.sha256(b"".join(contents)).hexdigest()[:16]
 
     def hindrance(self, problem: Problem) -> str | None:
-        """Asks the program itself, with error-free readings of the nominal point, twice."""
+        """Asks the program itself, with error-free readings of the start, twice."""
         with np.errstate(all="ignore"):
             z = np.repeat(problem.measurement.simulate(problem.x0[None]), 2, axis=0)
             if (lacking := super().hindrance(problem)) or not np.isfinite(z).all():

@@ -75,7 +75,7 @@ class EsMda(Estimator):
         d = objective.prior.deviations
         z, n, tally = objective.R.whiten(objective.z), len(objective.x0), objective.model.tally
         generators = own_generators(self.seed, objective.z)
-        # Members are distances from the nominal point in deviations of the prior.
+        # Members are distances from the start in deviations of the prior.
         s = objective.prior.coloured(normals(generators, self.members, n)) / d
         path = [s.mean(axis=1)]
         for weight in geometric_weights(np.array([1.0 / self.first]), self.steps)[0]:

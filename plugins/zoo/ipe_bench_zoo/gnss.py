@@ -97,7 +97,7 @@ class Gnss(Measurement):
     and four Galileo satellites over the presumed position, each read once in each of `rounds`
     epochs."""
     position: tuple[float, float, float] = (-3120042.0, 4084614.0, 3764026.0)
-    """The presumed position in m (ECEF): the nominal point, with clocks of 0."""
+    """The presumed position in m (ECEF): the start, with clocks of 0."""
     frame: Literal["enu", "ecef"] = "enu"
     """In which axes the position is estimated: east, north, up, or x, y, z."""
     rounds: Count = 1

@@ -112,7 +112,7 @@ class Triad(Magnitudes):
     """The magnitude about which sizes are chosen, in `unit`."""
     unit: str = "g"
     bias: Vector = (0.0, 0.0, 0.0)
-    """The presumed bias in `unit`; with the two that follow, the nominal point."""
+    """The presumed bias in `unit`; with the two that follow, the start."""
     scale: Vector = (0.0, 0.0, 0.0)
     """The presumed scale-factor errors, as plain numbers."""
     misalignment: Vector = (0.0, 0.0, 0.0)
@@ -174,7 +174,7 @@ class Accelerometer(Magnitudes):
     counts: Annotated[tuple[Vector, ...], MinLen(10)] | None = None
     """Counts r_k (attitudes, 3); None: those of a triad as presumed, in 26 directions."""
     bias: Vector = (32768.0, 32768.0, 32768.0)
-    """The presumed bias in counts; with the two that follow, the nominal point."""
+    """The presumed bias in counts; with the two that follow, the start."""
     scale: tuple[Positive, Positive, Positive] = (0.0024, 0.0024, 0.0024)
     """The presumed scale factors in m/s^2 per count."""
     misalignment: Vector = (0.0, 0.0, 0.0)

@@ -225,17 +225,19 @@ def test_what_the_parameters_imitate_is_found_with_what_it_does():
     assert stranger.noticed == pytest.approx(np.mean(stats.ncx2.sf(limit, 6, sizes**2)), abs=0.06)
 
 
-def test_the_tilt_that_looks_like_a_bias_is_named_before_anything_is_measured():
+def test_the_misaligned_platform_that_looks_like_a_bias_is_named_before_anything_is_measured():
     paper = scenario(Gins(), NOISE, 33.0)
     model, R, x = paper.measurement, paper.problem.R, paper.truths(0, 5)
     first, second, third = suspects(model, R, RicherGins(platform_misalignment=5.0), x)
-    assert {first.name, second.name} == {"tilt x", "tilt y"}
-    tilts = {s.name: s for s in (first, second, third)}
-    assert tilts["tilt y"].words == "tilt y + 0.24 bx"
-    assert tilts["tilt x"].words.startswith("tilt x - 0.24 by")
+    assert {first.name, second.name} == {"platform x", "platform y"}
+    turns = {s.name: s for s in (first, second, third)}
+    assert turns["platform y"].words == "platform y + 0.24 bx"
+    assert turns["platform x"].words.startswith("platform x - 0.24 by")
     # A platform that leans by an angle feels that share of gravity: 5 arcsec are 0.242 of 1e-4 g.
-    assert tilts["tilt y"].shift[0] == pytest.approx(-np.tan(np.deg2rad(5 / 3600)) / 1e-4, rel=0.02)
-    assert all(s.hidden and s.noticed < 2e-3 for s in tilts.values())
+    assert turns["platform y"].shift[0] == pytest.approx(
+        -np.tan(np.deg2rad(5 / 3600)) / 1e-4, rel=0.02
+    )
+    assert all(s.hidden and s.noticed < 2e-3 for s in turns.values())
 
 
 def test_a_richer_model_without_errors_is_refused():
