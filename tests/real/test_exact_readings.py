@@ -97,7 +97,9 @@ def test_a_parameter_that_may_go_to_infinity_is_said_to(expression, noise):
     answer = answered(expression, {"a": 4.0, "b": 1.0}, z)
     (one,) = answer
     assert one.x[0] == pytest.approx(5, abs=0.01)
-    assert one.undetermined == tuple(one.endless) == ("b",)
+    assert one.undetermined == ("b",)
+    assert tuple(one.endless) == (("b",),)
+    assert np.isnan(one.standard_errors[1])
     assert "The readings do not determine b (at lm)" in str(answer)
     assert "lm: b may go to infinity" in str(answer)
     assert answer.finding() == "the readings do not determine b"
@@ -108,4 +110,36 @@ def test_a_parameter_that_readings_tell_may_not_go_to_infinity(noise):
     z = 1e6 * (1 - np.exp(-3 * (np.array(X) + 1))) + noise * np.cos(7 * np.array(X))
     (one,) = answered("a*(1-exp(-b*(x+1)))", {"a": 1e6, "b": 1.0}, z)
     assert one.x == pytest.approx([1e6, 3], rel=1e-6)
-    assert one.undetermined == tuple(one.endless) == ()
+    assert one.undetermined == ()
+    assert one.endless == {}
+
+
+# Of https://github.com/scipy/scipy/issues/5980, where SciPy answers c = -358 with 1.5e8 for its
+# standard error.
+STEEP = [0.0] * 5 + [0.26899724779580747] + [0.0] * 10
+STEEP += [0.7596293832300737, 1.2214165441700262, 1.044997340851686, 0.7705897033203687]
+STEEP += [1.280988851538506, 1.4403870545862594, 1.439644250890874, 1.280013863325763]
+STEEP += [0.9349706185969648, 0.7035165962457238, 0.914155421686925]
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_parameters_that_run_off_together_have_no_standard_error(mirrored):
+    """A step between two readings: its height is the mean of those behind the one on it."""
+    t = np.arange(27.0)
+    t = -t if mirrored else t
+    model = Formula("b/(1+exp(-(c+d*t)))", dict.fromkeys("bcd", 0.5), {"t": tuple(t.tolist())})
+    answer = ib.estimate(model, np.array(STEEP))
+    one = answer["auto"]
+    assert one.x[0] == pytest.approx(np.mean(STEEP[17:]), abs=1e-4)
+    assert one.standard_errors[0] == pytest.approx(0.0547, abs=1e-4)
+    assert np.isnan(one.standard_errors[1:]).all()
+    assert tuple(one.endless) == (("c", "d"),)
+    assert "c and d may go to infinity, so there is no standard error" in str(answer)
+    assert "e+1" not in str(answer)
+
+
+def test_a_model_that_may_vanish_is_open_where_all_readings_are_zero():
+    model = Formula("a*exp(-b*x)+c", dict.fromkeys("abc", 1.0), {"x": X})
+    answer = ib.estimate(model, np.zeros(len(X)))
+    assert all(one.undetermined for one in answer)
+    assert "The readings do not determine" in str(answer)

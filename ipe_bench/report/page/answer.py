@@ -277,7 +277,7 @@ def _estimates(answer: Answer) -> Table:
         if one.passes:
             columns.append(texts(one.label, map(with_error, one.x, one.standard_errors)))
             continue
-        failing = "MISFIT"
+        failing = "NOT DETERMINED" if one.idle else "MISFIT"
         if one.status is not Status.CONVERGED:
             failing = one.status.label.replace("_", " ").upper()
         cells = [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
@@ -295,7 +295,7 @@ def with_error(value: float, error: float) -> str:
     # 0.0999 rounds to 0.10.
     rounded = float(f"{error:.1e}")
     place = math.floor(math.log10(rounded)) - 1
-    if place > 0 and 0 < abs(value) < _HIDDEN * error:
+    if place > 0 and abs(value) < _HIDDEN * error:
         # An error in the hundreds or more must not hide the value.
         return f"{value:.3g} ± {error:.2g}"
     return _together((value, error), " ± ", place)
@@ -381,11 +381,14 @@ def _notes_on_fit(one: Fit) -> Iterator[str]:
         yield f"{SEARCH}: Levenberg-Marquardt steps from the best of further starts."
     if one.beaten_by:
         yield (f"{one.label}: {one.beaten_by} found a significantly better fit; rejected.")
-    for name, value in one.endless.items():
-        yield (
-            f"{one.label}: {name} may go to infinity: with every {name} beyond {value:.4g} the"
-            " readings of the model are the same."
-        )
+    for names, values in one.endless.items():
+        name = " and ".join(names)
+        if len(names) == 1:
+            why = f"with every value beyond {values[0]:.4g} the readings of the model are the same"
+        else:
+            at = _values(dict(zip(names, values, strict=True)), 4)
+            why = f"from {at} they can grow together, and the readings of the model stay the same"
+        yield f"{one.label}: {name} may go to infinity, so there is no standard error: {why}."
     if one.lower_at:
         yield f"{one.label}: {one.lower_at} found a lower minimum; use that answer."
     for k, (low, high) in one.between.items():
@@ -472,7 +475,8 @@ def _values(values: Mapping[str, float], figures: int = 6) -> str:
 def _outliers(answer: Answer) -> Iterator[Table]:
     """Yields the most outlying readings, each with its largest residual and the estimators that
     find it so."""
-    told = [f for f in answer.fits if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
+    fits = [f for f in answer.fits if f.passes] or answer.fits
+    told = [f for f in fits if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
     if not told:
         return
     beyond = np.flatnonzero(np.any([f.outliers for f in told], axis=0))
