@@ -332,6 +332,17 @@ def test_links_lead_to_pages(page, generated):
         assert target.exists() or made.exists() or shown, link
 
 
+def test_a_page_that_was_merged_leads_to_the_page_that_has_its_content(tmp_path):
+    pages.write_redirects(tmp_path)
+    written = {path.relative_to(PAGES).with_suffix("").as_posix() for path in WRITTEN}
+    assert pages.MERGED.keys().isdisjoint(written)
+    for page in pages.MERGED:
+        stub = tmp_path / f"{page}.html"
+        (target,) = re.findall(r"url=([^\"]+)\.html", stub.read_text(encoding="utf-8"))
+        target = os.path.normpath(stub.parent.relative_to(tmp_path) / target)
+        assert target in written
+
+
 def test_options_are_described_from_class_and_config_and_say_what_they_mean():
     rows = {row.name: row for option in discovery.options("solver") for row in described(option)}
     assert rows["growth"].value == "2"

@@ -130,6 +130,17 @@ TABLES = "explanation/tables_of_states.md"
 """The page of what is stored of the experiment `states`."""
 CHECKED = "reference/checked.md"
 """The page of what is recorded of the tests that compare with a source."""
+MERGED = {
+    "howto/agents": "howto/plugins",
+    "howto/applications": "howto/hydra",
+    "howto/completion": "howto/hydra",
+    "howto/estimator_ci": "howto/compare",
+    "howto/python": "howto/notebook",
+    "howto/sweeps": "howto/hydra",
+    "howto/trials": "howto/hydra",
+    "howto/write_statistic": "howto/write_noise",
+}
+"""Pages of earlier versions, with the page that has their content now."""
 
 
 def build(output: Path, trials: int) -> int:
@@ -149,7 +160,19 @@ def build(output: Path, trials: int) -> int:
     places = (output / "html", output / "doctrees")
     site = Sphinx(source, None, *places, "html", SETTINGS, warningiserror=True, freshenv=True)
     site.build()
+    write_redirects(output / "html")
     return site.statuscode
+
+
+def write_redirects(html: Path) -> None:
+    """Leads readers of a page that was merged to the page that has its content now."""
+    for page, target in MERGED.items():
+        here = f"{os.path.relpath(target, Path(page).parent)}.html"
+        write_text(
+            html / f"{page}.html",
+            f'<!doctype html><meta charset="utf-8"><title>Moved</title>'
+            f'<meta http-equiv="refresh" content="0; url={here}"><a href="{here}">Moved</a>\n',
+        )
 
 
 def write_tables(source: Path) -> None:
