@@ -9,11 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import chdtri, fdtri, stdtrit
 
 from ipe_bench.basics.linalg import Array, Mask, repeated
@@ -266,7 +264,25 @@ class _Side:
 
     def _crossing(self, near: float, far: float, precision: float) -> float:
         """Finds the distance between `near` and `far` at which the rise is q."""
-        return cast(float, brentq(lambda d: self.rise(d) - self.q, near, far, xtol=precision))
+        # By the Illinois method (Dowell and Jarratt 1971): scipy.optimize takes .08 s to load.
+        low = self.rise(near) - self.q
+        high = self.rise(far) - self.q
+        turns = 0
+        while far - near > precision:
+            share = high / (high - low) if high > low else 0.5
+            met = far - share * (far - near)
+            # Beside an end, a step beyond the crossing closes the interval.
+            at = float(np.clip(met, near + precision / 2, far - precision / 2))
+            here = self.rise(at) - self.q
+            if here < 0:
+                near, low = at, here
+                high /= 2 if turns < 0 else 1
+                turns = -1
+            else:
+                far, high = at, here
+                low /= 2 if turns > 0 else 1
+                turns = 1
+        return far
 
     def rise(self, distance: float, *, around: bool = False) -> float:
         """Computes the rise of root chi-square at a distance; that of the least minimum found from

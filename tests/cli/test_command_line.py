@@ -483,6 +483,22 @@ def test_a_finished_run_shows_its_table_without_pandas(tmp_path):
     assert result.stdout.strip().endswith("False")
 
 
+ESTIMATED = """
+import sys
+from ipe_bench.cli.main import main
+main(["estimate", "measurement=nist/misra1a", "figures=none"])
+print([m for m in ("matplotlib.pyplot", "scipy.optimize") if m in sys.modules])
+"""
+
+
+@pytest.mark.slow
+def test_the_numbers_of_an_estimate_are_shown_without_what_takes_long_to_load(tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-c", ESTIMATED], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip().endswith("[]")
+
+
 @pytest.mark.slow
 def test_a_plugin_without_its_header_or_with_a_taken_name_is_refused(tmp_path):
     conf = tmp_path / "plugins/mine/mine/conf/solver"
