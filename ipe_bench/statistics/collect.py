@@ -205,9 +205,16 @@ def _groups(cells: Sequence[StoredCell], runs: Sequence[Mapping[str, Any]]) -> t
     leaves = differing([scenario_of(cell) for cell in firsts])
     leaves = [k for k in leaves if k != "error_scale" and not _stands_in_a_name(k, firsts)]
     options = {label: differing(list(several.values())) for label, several in configs.items()}
-    groups = [
-        _group(members, truths, leaves, options[members[0].label]) for members in found.values()
-    ]
+    texts = {
+        label: {
+            k: _shortened([_shown(one, [k])[k] for one in several.values()]) for k in options[label]
+        }
+        for label, several in configs.items()
+    }
+    groups = []
+    for members in found.values():
+        label = members[0].label
+        groups.append(_group(members, truths, leaves, texts[label]))
     order = _order_of_labels(runs)
 
     def place(group: Group) -> tuple[Any, ...]:
@@ -221,10 +228,10 @@ def _group(
     members: Sequence[StoredCell],
     truths: Mapping[str, StoredCell],
     leaves: Sequence[str],
-    options: Sequence[str],
+    options: Mapping[str, Mapping[str, str]],
 ) -> Group:
     """Forms a group of cells that were constructed alike; `leaves` of the scenario and `options` of
-    the estimator tell it from others."""
+    the estimator, with the texts of their values, tell it from others."""
     first = members[0]
     columns = {
         "measurement": first.names["measurement"],
@@ -235,7 +242,7 @@ def _group(
     chosen = _shown(first.footer["identity"]["estimator"], options)
     label = first.label
     if chosen:
-        values = ", ".join(f"{k}={v}" for k, v in chosen.items())
+        values = ", ".join(f"{k}={options[k][str(v)]}" for k, v in chosen.items())
         label = f"{label} ({values})"
     cells = sorted(members, key=lambda cell: (cell.seed, cell.key))
     return Group(
@@ -245,6 +252,19 @@ def _group(
         cells=tuple(cells),
         truths=tuple(truths.get(cell.scenario_id) for cell in cells),
     )
+
+
+def _shortened(values: Iterable[Any]) -> dict[str, str]:
+    """Returns the shortest texts that tell values apart, of numbers in at least four figures."""
+    distinct = {str(value): value for value in values}
+    for figures in range(4, 17):
+        texts = {
+            text: f"{value:.{figures}g}" if isinstance(value, float) and len(text) > 6 else text
+            for text, value in distinct.items()
+        }
+        if len(set(texts.values())) == len(texts):
+            return texts
+    return {text: text for text in distinct}
 
 
 def _order_of_labels(runs: Sequence[Mapping[str, Any]]) -> dict[str, int]:

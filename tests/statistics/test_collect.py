@@ -142,3 +142,23 @@ def test_columns_stand_in_one_order_whichever_other_estimators_there_are(tmp_pat
     for folder, estimators in (("few", few), ("more", more)):
         assert not compute([scenario], estimators, 4, tmp_path / folder)
     assert ib.load(tmp_path / "few").columns.tolist() == ib.load(tmp_path / "more").columns.tolist()
+
+
+@pytest.mark.parametrize(
+    ("growths", "shown"),
+    [
+        ([3.22332032510465, 2.0, 4.70110018], ["2", "3.223", "4.701"]),
+        ([3.22332032510465, 3.223321], ["3.22332", "3.223321"]),
+        ([3.0, np.nextafter(3.0, 4.0)], ["3", "3.0000000000000004"]),
+    ],
+)
+def test_a_label_says_no_more_of_an_option_than_tells_it_from_others(tmp_path, growths, shown):
+    scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    for growth in growths:
+        compute([scenario], {"progressive": ib.solvers.Progressive(growth=growth)}, 1, tmp_path)
+    groups = collect([tmp_path]).groups
+    assert sorted(group.estimator for group in groups) == [
+        f"progressive (growth={one})" for one in shown
+    ]
+    # What is computed with stands in a column of its own, whole.
+    assert {group.options["estimator.growth"] for group in groups} == set(growths)
