@@ -118,8 +118,19 @@ def run_command(arguments: Sequence[str]) -> int:
             stored = _Stored()
             for told, spec in zip(jobs.told, jobs.specs, strict=True):
                 task.compute(told, spec, stored.of(spec))
-        outcomes = task.outcomes if jobs.told else jobs.launch(task) or task.outcomes
+        outcomes = task.outcomes if jobs.told else _launched(jobs, task)
     return _conclude(jobs, outcomes)
+
+
+def _launched(jobs: Jobs, task: Task) -> list[Outcome]:
+    """Returns the outcomes of jobs, run by the launcher and the sweeper that the words choose."""
+    try:
+        return jobs.launch(task) or task.outcomes
+    except Exception:
+        if jobs.optimises:  # a sweeper has words of its own for a job that gave it no number
+            for outcome in task.outcomes:
+                float(outcome)
+        raise
 
 
 def _read(output: str) -> Results:

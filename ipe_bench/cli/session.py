@@ -125,6 +125,8 @@ class Jobs:
     specs: list[Spec]
     """Checked jobs; for a sweep whose jobs only its sweeper can choose, the first."""
     multirun: bool
+    optimises: bool = False
+    """Whether a sweeper chooses the jobs by what those before them gave."""
     maximises: bool = False
     told: list[list[str]] = field(default_factory=list)
     """The words of each job that this process runs; empty where Hydra's sweepers and launchers are
@@ -176,7 +178,7 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
             )
     if multirun and optimises:
         maximises = "maximize" in str(hydra.sweeper.get("direction", ""))
-        return Jobs(words, [spec_of(config)], True, maximises)
+        return Jobs(words, [spec_of(config)], True, optimises, maximises)
     if multirun:
         jobs = _swept(words, params)
         specs = [_spec(job) for job in jobs]

@@ -1,11 +1,14 @@
 """What a job returns to sweepers that optimise is the number that its report shows."""
 
 import importlib.util
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.main import main
+from ipe_bench.cli.run import Outcome, _launched
 
 SMALL = (
     "measurement=polynomial",
@@ -39,6 +42,24 @@ def test_of_a_sweep_the_least_is_said(capsys):
 def test_a_number_that_is_not_known_is_no_objective(capsys):
     assert main(["run", *SMALL, "trials=4", "objective=linear_lse.order_median"]) == 2
     assert "objective=linear_lse.order_median: is not known of" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("outcome", "optimises", "kind", "said"),
+    [
+        (Outcome("out", mistake="error_scale=-1: give more"), True, UserError, "error_scale=-1"),
+        (Outcome("out"), True, UserError, "objective: is not given"),
+        (Outcome("out", objective=1.0), True, ValueError, "No trials"),
+        (Outcome("out"), False, ValueError, "No trials"),
+    ],
+)
+def test_a_sweeper_that_got_no_number_ends_with_the_mistake(outcome, optimises, kind, said):
+    def launch(task):
+        raise ValueError("No trials are completed yet.")
+
+    jobs = SimpleNamespace(launch=launch, optimises=optimises)
+    with pytest.raises(kind, match=said):
+        _launched(jobs, SimpleNamespace(outcomes=[outcome]))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
