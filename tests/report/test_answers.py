@@ -32,7 +32,7 @@ from ipe_bench.report.figures.common import full_ticks, text
 from ipe_bench.report.figures.log import draw_log
 from ipe_bench.report.figures.views import looks_of, views
 from ipe_bench.report.page.answer import _drawings
-from ipe_bench.report.page.log import LogAnswer, _sentences
+from ipe_bench.report.page.log import LogAnswer, _facts, _finding
 from ipe_bench.report.style import FACES, house_style
 from ipe_bench.report.words import ends_in_percent, public, told_apart
 from ipe_bench.states import Smoother, Tracker, ekf, ukf
@@ -90,6 +90,9 @@ def test_the_band_of_a_straight_line_is_the_textbooks_and_equal_residuals_are_dr
     with house_style():
         fit, residuals = _drawings(found)
     assert sum(bool(ax.get_title()) for ax in residuals.figure.axes) == 1
+    # Beside the curve stand the residuals of the same fit.
+    beside = fit.figure.axes[1].collections[0].get_offsets()
+    np.testing.assert_allclose(beside, np.column_stack([x, found["auto"].normalised]))
     band = fit.figure.axes[0].collections[0].get_paths()[0].vertices
     s = np.sqrt(np.sum((z - np.polyval(np.polyfit(x, z, 1), x)) ** 2) / 3)
     for at in (1.0, 8.0):
@@ -105,7 +108,7 @@ def test_the_band_of_a_straight_line_is_the_textbooks_and_equal_residuals_are_dr
 def test_certified_readings_have_a_curve_over_their_input():
     found = ib.estimate(ib.measurements.Nist("Misra1a"))
     with house_style():
-        (fit,) = draw_fit(found.examination, found.z, FACES["auto"])
+        (fit,) = draw_fit(found.examination, found.z, found["auto"], FACES["auto"])
     assert fit.figure.axes[0].get_xlabel() == "x"
 
 
@@ -352,9 +355,30 @@ def test_a_page_says_what_was_tested_only_where_something_was(walked):
     found, _ = walked
     untested = [replace(one, mean_nis=np.nan, lost_from=None) for one in found.tracks]
     for tracks, tested in ((found.tracks, True), (untested, False)):
-        said = " ".join(_sentences(LogAnswer(found.log, tracks)))
-        assert ("Tested: the innovations of filters" in said) == tested
-        assert said.endswith("Smoothers, which use later readings: rts.")
+        answer = LogAnswer(found.log, tracks)
+        *numbers, smoothers = _facts(answer)
+        assert [one.partition(":")[0] for one in numbers] == [
+            "Size of innovations",
+            "Successive innovations",
+        ][: 2 * tested]
+        assert smoothers == "Smoothers: rts, which use later readings."
+        assert (_finding(answer) == "tracks") != tested
+
+
+def test_the_title_of_a_log_says_whether_the_model_fits_it(walked):
+    found, _ = walked
+    kf = replace(found["kf"], lost_from=None)
+    low, high = kf.limits
+    right = replace(kf, mean_nis=(low + high) / 2, white_p=0.5)
+    wrong = replace(kf, label="wide", mean_nis=2 * high, white_p=0.5)
+    coloured = replace(right, label="coloured", white_p=1e-6)
+    for tracks, title in (
+        ([right], "the model fits the log: kf consistent"),
+        ([right, wrong], "the model fits the log: kf consistent; wide overconfident"),
+        ([wrong, coloured], "no tracker fits the log: wide overconfident; coloured wrong"),
+    ):
+        assert _finding(LogAnswer(found.log, tracks)).startswith(title)
+    assert "by more than chance" in _facts(LogAnswer(found.log, [coloured]))[1]
 
 
 def test_a_filter_predicts_readings_from_those_before_and_a_smoother_the_missing_one(walked):

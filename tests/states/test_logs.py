@@ -172,8 +172,9 @@ def test_the_title_of_a_page_has_the_verdict_on_a_log_of_known_truth(verdict, tm
     answer = ib.estimate(FOLLOWED, z, {"kf": ekf(), "ukf": ukf(), "rts": Smoother(ekf())})
     write_page(tmp_path, answer, {}, figures=False)
     page = (tmp_path / "track.html").read_text(encoding="utf-8")
-    assert f"<title>{FOLLOWED.name}: kf, ukf, rts {verdict} ·" in page
-    assert "Smoothers, which use later readings: rts." in page
+    how = "the model fits" if verdict == "consistent" else "no tracker fits"
+    assert f"<title>{FOLLOWED.name}: {how} the log: kf, ukf, rts {verdict} ·" in page
+    assert ">Smoothers</b> rts, which use later readings." in page
 
 
 def test_the_title_of_a_page_names_the_trackers_of_each_verdict(tmp_path):
@@ -181,7 +182,10 @@ def test_the_title_of_a_page_names_the_trackers_of_each_verdict(tmp_path):
     few = {"kf": ekf(), "few": Bootstrap(3), "other": ukf()}
     write_page(tmp_path, ib.estimate(sharp, FOLLOWED.draw(0, 1).z[0], few), {}, figures=False)
     page = (tmp_path / "track.html").read_text(encoding="utf-8")
-    assert f"<title>{FOLLOWED.name}: kf, other overconfident; few collapsed ·" in page
+    assert (
+        f"<title>{FOLLOWED.name}: no tracker fits the log: kf, other overconfident; few collapsed ·"
+        in page
+    )
 
 
 @pytest.mark.slow
@@ -195,7 +199,10 @@ def test_titles_are_false_on_as_few_logs_as_their_limits_say(verdict, least, mos
     for z in TRUTHS[verdict].draw(0, 100).z:
         write_page(tmp_path, ib.estimate(FOLLOWED, z, {"kf": ekf()}), {}, figures=False)
         titles.append((tmp_path / "track.html").read_text(encoding="utf-8"))
-    called = sum(f"<title>{FOLLOWED.name}: kf consistent ·" in title for title in titles)
+    called = sum(
+        f"<title>{FOLLOWED.name}: the model fits the log: kf consistent ·" in title
+        for title in titles
+    )
     assert least <= called <= most
 
 

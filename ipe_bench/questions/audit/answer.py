@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,8 @@ import pandas as pd
 
 from ipe_bench.questions.audit.maths import Audit, audit, read_claims
 from ipe_bench.report.page.writer import digests, write_files
-from ipe_bench.report.tables.table import Part, Shown, Table, texts, words
+from ipe_bench.report.tables.table import Fact, Legend, Part, Shown, Table, texts, words
+from ipe_bench.report.words import counted
 
 
 class AuditAnswer(Shown, Audit):
@@ -30,16 +32,30 @@ class AuditAnswer(Shown, Audit):
         joint = "No covariances are reported, so directions are not judged."
         if self.claims.joint:
             joint = "The headline covers all parameters jointly."
-        notes = [
+        legend = Legend(
             "true over reported is the root mean square of errors in reported standard deviations,"
             " 1 if the report is right; bias is their mean. Intervals are joint, and valid for"
-            " heavy tails.",
-            joint,
-        ]
+            " heavy tails."
+        )
         title = f"Audit of {self.claims.runs} runs"
         if self.claims.left_out:
             title += f", {self.claims.left_out} rows without an estimate left out"
-        return [*self.sentences, Table("audit", title, "", columns, notes=notes)]
+        return [*self.sentences, Table("audit", title, "", columns, notes=[legend, joint])]
+
+    def facts(self) -> list[str]:
+        """States what was found besides the scale, and the parameter whose errors are farthest from
+        the report."""
+        _, *faults = self.sentences
+        found: list[str] = [Fact("Also found", sentence) for sentence in faults]
+        apart = [abs(math.log(f.value)) if 0 < f.value < math.inf else 0.0 for f in self.each]
+        if len(apart) > 1 and max(apart) > 0:
+            worst = apart.index(max(apart))
+            words = f"errors of {self.claims.names[worst]} are {self.each[worst].words}."
+            found.append(Fact("Worst parameter", words))
+        clear = (self.bias[:, 1] <= 0) & (self.bias[:, 2] >= 0)
+        if clear.all():
+            found.append(Fact("Bias", "of no parameter is it told from 0."))
+        return found
 
 
 def write_audit(folder: Path, found: AuditAnswer, sources: Sequence[tuple[str, str]]) -> None:
@@ -47,15 +63,20 @@ def write_audit(folder: Path, found: AuditAnswer, sources: Sequence[tuple[str, s
     from ipe_bench.questions.audit.figure import draw_audit
 
     parts = [part for part in found.parts() if isinstance(part, Table)]
-    title, *sentences = found.sentences
+    title = found.sentences[0]
     write_files(
         folder,
         "audit",
         ("audit.csv", found.table()),
         title.removesuffix("."),
-        sentences,
+        found.facts(),
         parts,
         draw_audit(found),
+        lead=(
+            "A covariance is right if the errors over their reported standard deviations have a"
+            " root mean square of 1."
+        ),
+        facts=[f"{found.claims.runs} runs", counted(found.claims.n, "parameter")],
         sources=sources,
     )
 

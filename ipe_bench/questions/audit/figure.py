@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import ndtri
 
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import BOUND_COLOR, FAMILIES
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, FAMILIES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,34 +18,56 @@ if TYPE_CHECKING:
     from ipe_bench.basics.linalg import Array
     from ipe_bench.questions.audit.maths import Audit
 
+MOST_POINTS = 300
+"""Points of a panel; of more errors these quantiles are drawn, the extremes among them."""
+_BENT = 30.0
+"""Errors, in reported deviations, beyond which the axis is logarithmic at its ends."""
+
 
 def draw_audit(found: Audit) -> Iterator[Drawing]:
-    """Draws the errors in reported standard deviations beside the law that the report claims, the
-    worst parameters."""
+    """Draws the quantiles of errors in reported standard deviations over those of the law that the
+    report claims, for the worst parameters."""
     claims = found.claims
     apart = [abs(np.log(max(factor.value, 1e-300))) for factor in found.each]
     worst = np.argsort(-np.array(apart), kind="stable")
     chosen = np.sort(worst[: common.most_panels()])
-    fig, axes = common.panels(len(chosen), height=2.4)
+    fig, axes = common.panels(len(chosen), height=3.2)
     for i, ax in zip(chosen, axes, strict=True):
-        _draw_errors(ax, claims.z[:, i])
-        common.title(ax, f"{claims.names[i]}: {found.each[i].value:.2f} times")
-    common.axis_labels(fig, "error / reported deviation", "")
+        expected, errors = quantiles(claims.z[:, i])
+        _draw_quantiles(ax, expected, errors, found.each[i].value)
+        common.title(ax, f"{claims.names[i]}: {found.each[i].value:.2f} times as reported")
+    common.axis_labels(fig, "quantile if reported right", "error / reported deviation")
     common.legend(fig, axes)
-    caption = f"Errors beyond ±{common.FARTHEST:g} reported deviations stand at the edge."
+    caption = "Steeper than the dashed line: larger than reported. Bent at its ends: heavy tails."
     if len(chosen) < claims.n:
         caption += f" The {len(chosen)} of {claims.n} parameters farthest from 1."
-    yield Drawing("audit", "Errors beside the reported covariance", caption, fig)
+    yield Drawing("audit", "Quantiles of errors beside the reported law", caption, fig)
 
 
-def _draw_errors(ax: Axes, z: Array) -> None:
-    """Draws the histogram of the errors z (trials,) in reported standard deviations, and the
-    standard normal density."""
-    shown = np.clip(z, -common.FARTHEST, common.FARTHEST)
-    ends = (-common.FARTHEST, common.FARTHEST)
-    color = FAMILIES["IPE"][0]
-    ax.hist(shown, bins=30, range=ends, density=True, color=color, alpha=0.45, label="errors")
-    at = np.linspace(*ends, 300)
-    claimed = np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)
-    ax.plot(at, claimed, color=BOUND_COLOR, linestyle="--", linewidth=1.0, label="as reported")
-    ax.set_yticks([])
+def quantiles(z: Array) -> tuple[Array, Array]:
+    """Returns quantiles of the standard normal law and the finite errors z (rows,) that stand at
+    them, in order; infinite errors count in the ranks."""
+    errors = np.sort(z)
+    rows = len(errors)
+    expected = ndtri((np.arange(rows) + 0.5) / rows)
+    even = np.linspace(expected[0], expected[-1], MOST_POINTS)
+    shown = np.unique(np.searchsorted(expected, even).clip(max=rows - 1))
+    if rows <= MOST_POINTS:
+        shown = np.arange(rows)
+    shown = shown[np.isfinite(errors[shown])]
+    return expected[shown], errors[shown]
+
+
+def _draw_quantiles(ax: Axes, expected: Array, errors: Array, factor: float) -> None:
+    """Draws errors over their quantiles, with the lines on which they would be as large as reported
+    and so many times as large."""
+    ends = np.array([expected[0], expected[-1]])
+    dashed: Any = {"color": BOUND_COLOR, "linestyle": BOUND_DASH}
+    color = FAMILIES["filters"][0]
+    ax.plot(ends, ends, label="as reported", zorder=3, **dashed)
+    if np.isfinite(factor):
+        ax.plot(ends, factor * ends, color=color, linewidth=1.0, label="so many times as large")
+    point: Any = {"linestyle": "none", "markersize": 3.0, "color": FAMILIES["IPE"][0]}
+    ax.plot(expected, errors, "o", label="errors", **point)
+    if np.abs(errors).max() > _BENT:
+        ax.set_yscale("symlog", linthresh=_BENT, linscale=1.0)

@@ -38,9 +38,9 @@ _GRID = 200
 """Points of a curve, where the model can be evaluated between the readings."""
 
 
-def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
-    """Draws readings z (m,) with the fitted curve and its band, if one numeric column alone tells
-    readings apart."""
+def draw_fit(found: Examination, z: Array, fit: Fit, look: Look) -> Iterator[Drawing]:
+    """Draws readings z (m,) with the fitted curve and its band, and residuals beside them, if one
+    numeric column alone tells readings apart."""
     model = found.whole.measurement
     columns = labels(model)
     varying = {name: column for name, column in columns.items() if len(set(column)) > 1}
@@ -57,8 +57,7 @@ def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
     at, fitted, error = _curve(found, name, x)
     freedom = None if found.freedom is None else float(np.min(found.freedom))
     half = half_width(CONFIDENCE, freedom) * error
-    fig, (ax,) = common.panels(1, height=3.2)
-    fig.set_figwidth(5.2)
+    fig, (ax, beside) = common.panels(2, height=3.2)
     band: Any = {
         "alpha": 0.2,
         "linewidth": 0,
@@ -70,8 +69,15 @@ def draw_fit(found: Examination, z: Array, look: Look) -> Iterator[Drawing]:
     ax.plot(x, z, "o", label="readings", zorder=3, **style)
     ax.set_xlabel(common.text(name))
     ax.set_ylabel(common.text(with_unit(model.reading_name, model.reading_unit)))
-    common.legend(fig, [ax])
-    caption = "Pointwise 95 % band, first order in the errors."
+    _residual_panel(beside, x.astype(float), fit, fit.outlier_limit, look.color)
+    beside.set(xlabel=common.text(name), ylabel="residual / its deviation")
+    common.title(ax, "readings and fit")
+    common.title(beside, f"residuals: {_tests(fit)}" if _tests(fit) else "residuals")
+    common.legend(fig, [ax, beside])
+    caption = (
+        "Pointwise 95 % band, first order in the errors. Residuals are standard normal if model and"
+        " noise are right."
+    )
     yield Drawing("fit", "Readings and fitted curve", caption, fig)
 
 

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_PANELS = 8
-FARTHEST = 4.5
-"""Standard deviations about the middle that a distribution is drawn to."""
 REACH = 0.3
 """Part of the span of the points that intervals may add to an axis at either end."""
 _SAME_END = 0.01

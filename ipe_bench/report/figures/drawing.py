@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 MOST_LETTERS = 300_000
 """Length of a figure on a page from which on its curves and points are a bitmap."""
+_WIDE = 9.0
+"""Inches of a figure above which facts have no room beside it."""
 _METADATA: dict[str, Any] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 """The same figure is the same file whenever it is drawn."""
 
@@ -32,6 +34,8 @@ class Drawn:
     files: tuple[Path, ...]
     html: str
     """The figure as a page shows it."""
+    wide: bool
+    """Whether it takes the width of the page."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,8 @@ class Drawing:
         files = self.save(folder, formats)
         # Laid out once: again for the page takes a third of the time.
         self.figure.set_layout_engine("none")
-        return Drawn(self.name, self.title, self.caption, files, self.html())
+        wide = self.figure.get_figwidth() > _WIDE
+        return Drawn(self.name, self.title, self.caption, files, self.html(), wide)
 
     def shown(self) -> Canvas:
         """Shows the figure itself in a notebook."""

@@ -26,7 +26,17 @@ from ipe_bench.real.fits import TOO_WELL, Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.real.search import LABEL as SEARCH
 from ipe_bench.report.page.writer import write_files
-from ipe_bench.report.tables.table import Part, Shown, Strong, Table, naming, texts, words
+from ipe_bench.report.tables.table import (
+    Fact,
+    Legend,
+    Part,
+    Shown,
+    Strong,
+    Table,
+    naming,
+    texts,
+    words,
+)
 from ipe_bench.report.words import enumerate_few, p_value
 from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -55,6 +65,7 @@ _HIDDEN = 1e-3
 _MOST_FIGURES = 12
 """Figures beyond which two numbers are not written to one place."""
 _MOST_READINGS = 5
+_NONLINEAR = "The model is strongly nonlinear"
 _MOST_MINIMA = 3
 
 
@@ -202,15 +213,13 @@ class Answer(Labelled[Fit]):
         if not self.passes:
             return "no estimate is at the lowest minimum of chi-square"
         one = self._stated
-        found = [f"{enumerate_few(_with_errors(one), 2)} by {one.label}"]
+        found = [f"{enumerate_few(self._recommended, 2)} by {one.label}"]
         if one.exact:
             found.append("which meets every reading exactly")
         elif _resembling(one):
             found.append("in doubt, because successive residuals resemble each other")
         elif one.fits:
             found.append("which passes every test")
-        else:
-            found.append("fit not tested because the noise is unknown")
         told = self.examination
         if told and told.overstated:
             found.append("though the stated noise is too large")
@@ -226,35 +235,85 @@ class Answer(Labelled[Fit]):
         examined = [one for one in passing if told and one.label == told.label]
         return [*examined, *passing][0]
 
+    @property
+    def by_profile(self) -> bool:
+        """Whether profile intervals replace standard errors: the model is strongly nonlinear."""
+        told = self.examination
+        if not self.passes or told is None or told.overstated:
+            return False
+        return told.label == self._stated.label and bool(told.bent.any())
+
+    @property
+    def _recommended(self) -> list[str]:
+        """Each parameter with its standard error, or with its profile interval in parentheses where
+        that is to be used."""
+        one = self._stated
+        told = self.examination
+        if told is None or not self.by_profile:
+            return _with_errors(one)
+        names = [p.name for p in told.model.physical_parameters]
+        ends = dict(zip(names, np.transpose(told.profiles), strict=True))
+        found = []
+        for p, x, error in zip(
+            one.model.physical_parameters, one.x, one.standard_errors, strict=True
+        ):
+            value = f"{_number(x, 6)} (on its bound)"
+            if p.name in ends:
+                value = f"{_beside(x, error)} ({_interval(*ends[p.name], x)})"
+            found.append(f"{p.name} = {value} {p.unit}".rstrip())
+        return found
+
+    def lead(self) -> str:
+        """Says what stands beside the values of the title."""
+        if not self.passes or self._lacking:
+            return ""
+        if self.by_profile:
+            return (
+                f"In parentheses: {100 * CONFIDENCE:.0f} % profile intervals. Use them in place of"
+                " standard errors, for the model is strongly nonlinear here."
+            )
+        return "" if self._stated.exact else "Estimates ± standard errors."
+
     def sentences(self) -> list[str]:
         """Says who has an answer, what it is, and what a reader should know first."""
         others = enumerate_few([one.label for one in self.fits if not one.passes])
         if not self.passes:
             return [f"No answer that passes: {others or 'a better minimum was found'}."]
         passing = [one for one in self.fits if one.passes]
-        tested = enumerate_few([one.label for one in passing if not _resembling(one)])
+        tested = [one.label for one in passing if not _resembling(one)]
         resembling = enumerate_few([one.label for one in passing if _resembling(one)])
         tests = "every test"
         if passing[0].exact:
             tests = "the only test that readings without noise allow: residuals are round-off"
         elif not passing[0].fits:
-            tests = "the available tests (the size of residuals cannot be tested: noise unknown)"
+            tests = (
+                "the tests that there are: the noise is unknown, so the size of residuals is not"
+                " tested"
+            )
         said = []
         if tested:
-            said.append(f"Passing {tests}: {tested}")
+            verb = "passes" if len(tested) == 1 else "pass"
+            said.append(f"{enumerate_few(tested)} {verb} {tests}")
         if resembling:
-            said.append(
-                f"{'in' if said else 'In'} doubt, for successive residuals resemble each other:"
-                f" {resembling}"
-            )
+            said.append(f"in doubt, because successive residuals resemble each other: {resembling}")
         if others:
             said.append(f"no answer: {others}")
-        found = [f"{'; '.join(said)}."]
-        one = self._stated
-        found.append(f"{one.label}: {enumerate_few(_with_errors(one), 4)}.")
+        found: list[str] = [Fact("Tests", f"{'; '.join(said)}.")]
+        recommended = self._recommended
+        if len(recommended) > 2:
+            found.append(Fact("Estimate", f"{enumerate_few(recommended, 6)}."))
         if self.examination:
-            found += remarks(self.examination, _Labels(self.model))
-        return found[:3]
+            told = remarks(self.examination, _Labels(self.model))
+            found += [_labelled(one) for one in told if not one.startswith(_NONLINEAR)]
+        return found
+
+
+def _labelled(remark: str) -> str:
+    """Puts a label before a remark that has none of its own."""
+    label, _, text = remark.partition(": ")
+    if label.isupper():
+        return Fact(label.capitalize(), text)
+    return Fact(label, text) if text and " " not in label else Fact("Remark", remark)
 
 
 def _resembling(one: Fit) -> bool:
@@ -299,6 +358,12 @@ def with_error(value: float, error: float) -> str:
         # An error in the hundreds or more must not hide the value.
         return f"{value:.3g} ± {error:.2g}"
     return _together((value, error), " ± ", place)
+
+
+def _beside(value: float, error: float) -> str:
+    """Returns a value to two figures of its error, and to three of its own at least."""
+    figures = math.log10(abs(value) / error) if value and error > 0 else 0.0
+    return _number(value, min(max(math.ceil(figures) + 2, 3), _MOST_FIGURES))
 
 
 def _together(values: Sequence[float], between: str, place: int) -> str:
@@ -348,7 +413,7 @@ def _notes(answer: Answer) -> Iterator[str]:
     """Yields the notes on the fits: what tests mean, each estimator's own ones, noise and
     priors."""
     fits = answer.fits
-    yield (
+    yield Legend(
         f"An estimate fits if p of chi-square is at least {FIT_LEVEL:g}. white p: p-value of the"
         " Ljung-Box test, which is small if successive residuals resemble each other. deviation is"
         " the standard deviation of the residuals, in the unit of the readings."
@@ -606,7 +671,7 @@ def _on_profiles(found: Examination, names: Sequence[str]) -> Iterator[str]:
         each = [f"{name} {text}" for name, text in zip(names, intervals, strict=True)]
         ends = enumerate_few(list(compress(each, found.bent)), 3)
         level = f"{100 * CONFIDENCE:.0f} %"
-        yield f"The model is strongly nonlinear here: use the {level} profile intervals, {ends}."
+        yield f"{_NONLINEAR} here: use the {level} profile intervals, {ends}."
     unlimited = list(compress(names, np.any(np.isinf(found.profiles), axis=0)))
     if unlimited:
         yield f"The readings do not bound one side of {', '.join(unlimited)}."
@@ -675,14 +740,20 @@ def write_page(
         (RESIDUALS, _residuals(answer)),
         f"{answer.name}: {answer.finding()}",
         answer.sentences(),
-        answer.parts(),
+        _first(answer.parts(), "intervals" if answer.by_profile else "estimates"),
         _drawings(answer) if figures else (),
+        lead=answer.lead(),
         facts=[f"{np.isfinite(answer.z).sum()} readings"],
         sources=read_from(provenance),
     )
     for old in {folder / each for each in FILES} - set(files):
         old.unlink(missing_ok=True)
     return files
+
+
+def _first(parts: Iterable[Part], name: str) -> list[Part]:
+    """Puts the table of this name before the other parts."""
+    return sorted(parts, key=lambda part: not (isinstance(part, Table) and part.name == name))
 
 
 def _drawings(answer: Answer) -> Iterator[Drawing]:
@@ -692,7 +763,7 @@ def _drawings(answer: Answer) -> Iterator[Drawing]:
     found = answer.examination
     if found is not None and answer[found.label].passes:
         look = looks_of({one.label: one.estimator for one in answer.fits})
-        yield from draw_fit(found, answer.z, look[found.label])
+        yield from draw_fit(found, answer.z, answer[found.label], look[found.label])
     yield from draw_residuals(answer.model, answer.fits)
 
 

@@ -14,9 +14,20 @@ from ipe_bench.measurements.base import with_unit
 from ipe_bench.real.logs import SEARCHES, Log, LogQuestion, LogTracks, far_below
 from ipe_bench.report.page.answer import Labelled, as_json, read_from, with_error
 from ipe_bench.report.page.writer import write_files
-from ipe_bench.report.tables.table import Part, Strong, Table, interval, naming, texts, words
+from ipe_bench.report.tables.table import (
+    Fact,
+    Legend,
+    Part,
+    Strong,
+    Table,
+    interval,
+    naming,
+    texts,
+    words,
+)
 from ipe_bench.report.words import enumerate_few, p_value, short
-from ipe_bench.statistics.verdicts import NO_VERDICT, shown
+from ipe_bench.statistics.verdicts import CONSISTENT, NO_VERDICT, shown
+from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,12 +49,12 @@ _NOTE = (
     " it."
 )
 _OF_PARTICLES = (
-    " Innovations of particles are by the mean and covariance of the readings that they predict;"
+    "Innovations of particles are by the mean and covariance of the readings that they predict;"
     " effective particles: 1 / sum of squared weights, the median of all epochs; collapsed: below"
     " 2."
 )
 _OF_CONSTANTS = (
-    f" Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
+    f"Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
     " the innovations, so only whiteness tests the model."
 )
 _STORED = (
@@ -128,14 +139,14 @@ class LogAnswer(Labelled[LogTracks]):
             texts("white p", [p_value(one.white_p) for one in found]),
             texts("log likelihood", likelihoods),
         ]
-        note = _NOTE
+        notes = [Legend(_NOTE)]
         if np.isfinite([one.effective for one in found]).any():
             columns.append(texts("effective particles", [short(one.effective) for one in found]))
-            note += _OF_PARTICLES
+            notes.append(Legend(_OF_PARTICLES))
         if any(one.constants for one in found):
-            note += _OF_CONSTANTS
+            notes.append(Legend(_OF_CONSTANTS))
         title = f"{self.log.model.name}: is the filter right?"
-        return Table("innovations", title, "", columns, notes=[note])
+        return Table("innovations", title, "", columns, notes=notes)
 
     def _last_states(self) -> Table:
         columns = naming("state", self.log.model.states)
@@ -181,10 +192,14 @@ def write_page(
         folder,
         NAME,
         (TABLE, answer.table()),
-        f"{log.model.name}: {_verdicts(answer) or 'tracks'}",
-        _sentences(answer),
+        f"{log.model.name}: {_finding(answer)}",
+        _facts(answer),
         answer.parts(),
         draw_log(log, answer.tracks) if figures else (),
+        lead=(
+            "A model fits if innovations, readings less predictions, are as large as it says and do"
+            " not resemble each other."
+        ),
         facts=[f"{readings} readings at {log.model.epochs} epochs"],
         sources=read_from(provenance),
     )
@@ -199,21 +214,44 @@ def _trackers(answer: LogAnswer) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _verdicts(answer: LogAnswer) -> str:
-    """Names the trackers of each verdict; empty if none was tested."""
+def _finding(answer: LogAnswer) -> str:
+    """Says whether the model fits the log by any tracker, and names the trackers of each
+    verdict."""
     by_verdict: dict[str, list[str]] = {}
     for one in answer:
         if one.verdict != NO_VERDICT:
             by_verdict.setdefault(one.verdict, []).append(one.label)
-    return "; ".join(f"{enumerate_few(who)} {shown(word)}" for word, who in by_verdict.items())
+    if not by_verdict:
+        return "tracks"
+    told = "; ".join(f"{enumerate_few(who)} {shown(word)}" for word, who in by_verdict.items())
+    if CONSISTENT in by_verdict:
+        return f"the model fits the log: {told}"
+    return f"no tracker fits the log: {told}"
 
 
-def _sentences(answer: LogAnswer) -> list[str]:
-    """Says what the verdicts of the title are of, and which trackers are smoothers."""
-    said = []
-    if _verdicts(answer):
-        said.append("Tested: the innovations of filters, and the cost of a smoother's path.")
+def _facts(answer: LogAnswer) -> list[str]:
+    """States the numbers behind the verdict of the first tracker that is tested, filters before
+    smoothers, and which trackers are smoothers."""
+    told: list[str] = []
+    tested = [one for one in answer if one.verdict != NO_VERDICT and np.isfinite(one.mean_nis)]
+    for one in sorted(tested, key=lambda one: one.smooths)[:1]:
+        low, high = map(short, one.limits)
+        told.append(
+            Fact(
+                "Size of innovations",
+                f"NIS / m of {one.label} is {short(one.mean_nis)}; {low} to {high} if the model is"
+                " right.",
+            )
+        )
+        if np.isfinite(one.white_p):
+            alike = "no more than" if one.white_p >= FIT_LEVEL else "by more than"
+            told.append(
+                Fact(
+                    "Successive innovations",
+                    f"they resemble each other {alike} chance explains: p {p_value(one.white_p)}.",
+                )
+            )
     smoothers = [one.label for one in answer if one.smooths]
     if smoothers:
-        said.append(f"Smoothers, which use later readings: {enumerate_few(smoothers)}.")
-    return said
+        told.append(Fact("Smoothers", f"{enumerate_few(smoothers)}, which use later readings."))
+    return told

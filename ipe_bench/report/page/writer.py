@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
     from ipe_bench.report.figures.drawing import Drawing
 
+MOST_FACTS = 4
+"""Facts that a page shows at once."""
 COMMAND: ContextVar[str] = ContextVar("command", default="")
 """The command that is being run, for its page; empty in Python."""
 
@@ -152,12 +154,13 @@ def write_files(
     parts: Iterable[Part],
     drawings: Iterable[Drawing] = (),
     *,
+    lead: str = "",
     facts: Sequence[str] = (),
     sources: Sequence[tuple[str, str]] = (),
 ) -> list[Path]:
     """Writes the files of a command and returns them: the `table` under its name, the page
-    `name`.html with at most three sentences and the first of its tables seen at once, and its
-    figures."""
+    `name`.html with a few sentences, the first figure and the first of its tables seen at
+    once, and its figures."""
     files = [folder / table[0], folder / f"{name}.html"]
     write_text(files[0], csv_text(table[1]))
     with house_style() if drawings else nullcontext():
@@ -169,8 +172,8 @@ def write_files(
     commands = [public(command)] if command else []
     facts = [*facts, f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"]
     sections = [("details", "Details", [*figures[1:], *rest])]
-    page = Page(
-        name, title, list(answer)[:3], [*figures[:1], *first], sections, commands, sources, facts
-    )
+    seen = [*figures[:1], *first]
+    told = list(answer)[:MOST_FACTS]
+    page = Page(name, title, told, seen, sections, commands, sources, facts, lead)
     write_text(files[1], page.html())
     return [*files, *(file for figure in figures for file in figure.files)]

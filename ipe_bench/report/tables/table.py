@@ -83,12 +83,12 @@ class Fact(str):
     def __new__(cls, label: str, text: str) -> Fact:
         one = super().__new__(cls, f"{label}: {text}")
         one.label = label
-        one.text = f"{text[:1].upper()}{text[1:]}"
+        one.text = text
         return one
 
     def __getnewargs__(self) -> tuple[str, str]:
         """Lets it be copied and sent to other processes."""
-        return self.label, self.removeprefix(f"{self.label}: ")
+        return self.label, self.text
 
     label: str
     text: str
@@ -96,6 +96,10 @@ class Fact(str):
 
 class Strong(str):
     """A sentence that stands out."""
+
+
+class Legend(str):
+    """A note that says what columns mean, which a page folds."""
 
 
 class Shown:
@@ -380,6 +384,7 @@ def environment() -> Environment:
 
     made.filters["soft"] = soft
     made.tests["strong"] = lambda part: isinstance(part, Strong)
+    made.tests["legend"] = lambda part: isinstance(part, Legend)
     made.globals["MOST_ROWS"] = MOST_ROWS
     made.globals["SIGNS"] = SIGNS
     made.globals["ramps"] = [inked(RAMP), inked(DARK_RAMP)]

@@ -8,9 +8,11 @@ import pandas as pd
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.questions import question_command
+from ipe_bench.questions.audit.figure import MOST_POINTS, quantiles
 from ipe_bench.questions.audit.maths import Claims, _tails, _worst_direction, audit, read_claims
 
 
@@ -385,3 +387,18 @@ def test_a_bundle_adjustment_in_pixels_reports_the_covariance_of_errors_of_one_p
     assert whitened.verdict not in ("too small", "too large")
     assert whitened.scale.low < 1 < whitened.scale.high
     assert len(whitened.sentences) == 1
+
+
+def test_drawn_quantiles_are_those_of_the_normal_law_and_infinite_errors_keep_their_ranks():
+    rng = np.random.default_rng(0)
+    z = np.append(2.0 * rng.standard_normal(197), [np.inf, -np.inf, np.inf])
+    expected, errors = quantiles(z)
+    ranks = (np.arange(200) + 0.5) / 200
+    np.testing.assert_allclose(expected, norm.ppf(ranks)[1:-2])
+    np.testing.assert_array_equal(errors, np.sort(z[np.isfinite(z)]))
+    # Of many errors the extremes are among those that are drawn.
+    many = rng.standard_normal(50_000)
+    expected, errors = quantiles(many)
+    assert len(errors) <= MOST_POINTS
+    assert {many.min(), many.max()} <= set(errors)
+    assert np.abs(errors - expected)[5:-5].max() < 0.3
