@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property, reduce
+from dataclasses import dataclass, field
+from functools import lru_cache, reduce
 from operator import add, mul
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,7 +43,7 @@ class Step:
 
     key: str
     """Stands for the program."""
-    record: Callable[[], Program]
+    record: Callable[[], Program] = field(compare=False)
     """Records it, which is asked for only if it is not kept as machine code."""
     carried: int
     each: int
@@ -59,18 +59,21 @@ class Step:
     ) -> None:
         """Advances carry (trials, carried) by `count` epochs."""
         trials, length, _ = out.shape
-        self._code(at(carry), at(each), at(shared), at(out), trials, first, by, count, length)
+        run = _compiled(self)
+        run(at(carry), at(each), at(shared), at(out), trials, first, by, count, length)
 
-    @cached_property
-    def _code(self) -> Callable[..., None]:
-        width = compiled.width()
-        digests = [compiled.digest_of(file) for file in _FILES]
-        key = repr((self.key, width, digests))
-        return compiled.load(key, lambda: self._written(width), "scan", _ARGUMENTS)
 
-    def _written(self, width: int) -> str:
+@lru_cache(maxsize=256)
+def _compiled(step: Step) -> Callable[..., None]:
+    width = compiled.width()
+    digests = [compiled.digest_of(file) for file in _FILES]
+    key = repr((step.key, width, digests))
+
+    def write() -> str:
         emit = importlib.import_module("ipe_bench.engine.emit")
-        return emit.scan(self, self.record(), width)
+        return emit.scan(step, step.record(), width)
+
+    return compiled.load(key, write, "scan", _ARGUMENTS)
 
 
 Matrix = Sequence[Sequence[Any]]

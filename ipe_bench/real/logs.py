@@ -27,6 +27,7 @@ from ipe_bench.states.copies import SURE
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
 from ipe_bench.states.lost import why_lost
 from ipe_bench.states.particles import Bootstrap
+from ipe_bench.states.redone import unchanged
 from ipe_bench.states.smoothers import Smoother
 from ipe_bench.states.trackers import Tracker, Tracks
 from ipe_bench.statistics.intervals import mean_limits
@@ -573,8 +574,10 @@ def found_and_tracked(
         logarithms = u[sought.positive]
         if (np.isfinite(logarithms) & (np.abs(logarithms) >= _FAR)).any():
             return np.inf
+        if not np.isfinite(sought.values(u)).all():
+            return np.inf
         try:
-            model = sought.at(u)
+            model = sought.near(u)
         except UserError:
             # A model in Python may take no 0.
             return np.inf
@@ -584,7 +587,7 @@ def found_and_tracked(
         value = -float(tracks.log_likelihood[0])
         return value if tracks.degrees.any() and np.isfinite(value) else np.inf
 
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"), unchanged():
         best, *others = _minima(cost, sought.positive, watch)
     if not best.is_maximum:
         message = (
@@ -671,12 +674,19 @@ class _Sought:
 
     def at(self, u: Array) -> StateModel:
         """Returns the model with the numbers at u."""
+        return replace(self.model, **self._options(u))  # type: ignore[type-var]
+
+    def near(self, u: Array) -> StateModel:
+        """Returns the same model, whose functions are not tried again."""
+        return self.model.with_numbers(self._options(u))
+
+    def _options(self, u: Array) -> dict[str, Any]:
         parts: dict[str, Any] = {}
         for (key, name), value in zip(self.places, self.values(u).tolist(), strict=True):
             if name:
                 value = {**parts.get(key, getattr(self.model, key)), name: value}
             parts[key] = value
-        return replace(self.model, **parts)  # type: ignore[type-var]
+        return parts
 
     def at_zero(self, best: _Minimum) -> list[str]:
         """Names the numbers that are held at 0."""

@@ -141,6 +141,19 @@ class EpochFunctions:
     def at(self) -> Mapping[int, Recording]:
         return {k: one.at(i) for one in self.recordings for i, k in enumerate(one.epochs.tolist())}
 
+    def places(self, K: int) -> tuple[Array, Array]:
+        """Returns of each of K epochs (K,) which recording has it, and its place there."""
+        which = np.zeros(K, dtype=int)
+        place = np.zeros(K, dtype=int)
+        for i, one in enumerate(self.recordings):
+            which[one.epochs] = i
+            place[one.epochs] = np.arange(len(one.epochs))
+        return which, place
+
+    def same_numbers(self, other: EpochFunctions) -> bool:
+        pairs = zip(self.recordings, other.recordings, strict=True)
+        return all(np.array_equal(one.numbers, again.numbers, True) for one, again in pairs)
+
     def way(self, name: str) -> str:
         """Says how the function of that name is run, and why not as machine code; empty if it is
         recorded."""
@@ -227,19 +240,37 @@ def joined(forms: Forms) -> list[Recording]:
     return recordings
 
 
-def is_as_recorded(functions: EpochFunctions, forms: Forms) -> bool:
-    """Tells whether functions are those of a second recording: in every form, and in the numbers of
-    every epoch."""
-    recorded = [one for one in functions.recordings if one.form is not None]
-    if {one.form for one in recorded} != set(forms):
-        return False
-    for one in recorded:
-        again = forms[one.form]
-        if [*again] != one.epochs.tolist():
-            return False
-        if not np.array_equal(one.numbers, [part.numbers for part in again.values()], True):
-            return False
-    return True
+def renumbered(functions: EpochFunctions, model: StateModel, name: str) -> EpochFunctions | None:
+    """Returns the function of that name of a model that differs in numbers from the one whose
+    functions these are; None if it differs in more.
+
+    Raises:
+        NotRecorded: it cannot be recorded any more.
+    """
+    recorded = [one for one in functions.recordings if isinstance(one.function, RowFunction)]
+    epochs = sorted(k for one in recorded for k in one.epochs.tolist())
+    numbers = model.recorded_numbers(name, epochs) if recorded else {}
+    if {one.form for one in recorded} != set(numbers):
+        return None
+    function = getattr(model, name)
+    recordings = []
+    for one in functions.recordings:
+        if isinstance(one.function, RowFunction):
+            at, there = numbers[one.form]
+            if not np.array_equal(at, one.epochs):
+                return None
+            own = [_of_model(each, function) for each in one.own]
+            recordings.append(one._replace(numbers=there, own=own))
+        else:
+            recordings.append(one._replace(function=_of_model(one.function, function)))
+    return replace(functions, recordings=recordings)
+
+
+def _of_model(own: Judged, function: Function) -> Judged:
+    """Returns a function of an epoch with another model's in its place, judged as it was."""
+    if not isinstance(own.function, AtEpoch):
+        return own
+    return replace(own, function=AtEpoch(function, own.function.k))
 
 
 def functions_of(model: StateModel) -> tuple[EpochFunctions, EpochFunctions]:

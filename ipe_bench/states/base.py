@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -25,11 +25,12 @@ from ipe_bench.states.along import (
     Recording,
     astray,
     functions_of,
-    is_as_recorded,
     joined,
+    renumbered,
     written_by_epoch,
 )
 
+_FUNCTIONS = ("transition", "observe")
 _START, _PROCESS, _READINGS = range(3)
 """The random streams of a trial: its start, its process noise and the noise of its readings."""
 
@@ -61,6 +62,15 @@ class Kept(dict[Any, Any]):
 
     def __reduce__(self) -> tuple[type[Kept], tuple[()]]:
         return Kept, ()
+
+
+class Numbered(NamedTuple):
+    """Holds the numbers of a recorded function."""
+
+    epochs: Array
+    """(e,)"""
+    numbers: Array
+    """(e, p)"""
 
 
 class Fault(NamedTuple):
@@ -179,17 +189,39 @@ class StateModel(Component, ABC):
         change of a table or a dictionary that they take numbers from."""
         if "_functions" not in vars(self):
             return
-        names = ("transition", "observe")
-        for name, functions in zip(names, self.epoch_functions, strict=True):
-            recorded = [one for one in functions.recordings if one.form is not None]
-            epochs = sorted(k for one in recorded for k in one.epochs.tolist())
+        for name, functions in zip(_FUNCTIONS, self.epoch_functions, strict=True):
             try:
-                same = not epochs or is_as_recorded(functions, self._written(name, epochs))
+                again = renumbered(functions, self, name)
             except NotRecorded:
-                same = False
-            if not same:
+                again = None
+            if again is None or not functions.same_numbers(again):
                 del vars(self)["_functions"]
                 return
+
+    def with_numbers(self, options: Mapping[str, Any]) -> StateModel:
+        """Returns the model with other values of options that are numbers. Its functions are taken
+        to be as they were tried, with these numbers, if nothing else is recorded of them: a search
+        tries many, and its end by itself."""
+        other = self._with(options)
+        try:
+            pairs = zip(_FUNCTIONS, self.epoch_functions, strict=True)
+            found = [renumbered(functions, other, name) for name, functions in pairs]
+        except Exception:  # a model may raise anything where it meets no numbers
+            return other
+        if None not in found:
+            vars(other)["_functions"] = other, tuple(found)
+        return other
+
+    def _with(self, options: Mapping[str, Any]) -> StateModel:
+        return replace(self, **options)  # type: ignore[type-var]
+
+    def recorded_numbers(self, name: str, epochs: Sequence[int]) -> Mapping[Any, Numbered]:
+        """Returns, by what else is recorded, the epochs (e,) at which `transition` or `observe` is
+        that, and their numbers (e, p)."""
+        found = {}
+        for form, at in self._written(name, epochs).items():
+            found[form] = Numbered(np.array([*at]), np.array([one.numbers for one in at.values()]))
+        return found
 
     def astray(self, x: Array) -> Mask:
         """Finds the trials (trials,) with paths x (trials, 1 + K, n) at which recorded functions
@@ -240,6 +272,15 @@ class StateModel(Component, ABC):
     def gain(self, k: int) -> Array:
         """Returns G (n, q) of the step into epoch k; UserError if it depends on the states."""
         raise self._by_state("gain")
+
+    def gains(self, epochs: Array) -> Array:
+        """Returns G (e, n, q) of the steps into these epochs (e,)."""
+        each = [self.gain(k) for k in epochs.tolist()]
+        return np.stack(each) if each else np.zeros((0, self.n, 0))
+
+    def covariances(self, epochs: Array) -> Array:
+        """Returns R (e, m, m) of the readings of these epochs (e,)."""
+        return np.stack([self.R(k) for k in epochs.tolist()])
 
     def R(self, k: int) -> Array:
         """Returns the covariance (m, m) of the readings of epoch k; UserError if it depends on the

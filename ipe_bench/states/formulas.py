@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -12,7 +13,7 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
+from ipe_bench.basics.options import Count, Entries, Finite, NonNegative, Positive
 from ipe_bench.engine.rows import RowFunction
 from ipe_bench.engine.trace import (
     Expression,
@@ -26,7 +27,7 @@ from ipe_bench.engine.trace import (
 from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.states.along import Recording
-from ipe_bench.states.base import Normal, Paths, StateModel
+from ipe_bench.states.base import Normal, Numbered, Paths, StateModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,9 +160,6 @@ class Formulas(StateModel):
             clock["dt"] = np.diff(self._times, prepend=before)
         return clock
 
-    def _at_epoch(self, k: int) -> dict[str, float]:
-        return {name: float(values[k]) for name, values in self._clock.items()}
-
     @property
     def log_inputs(self) -> tuple[str, ...]:
         return tuple(self.inputs)
@@ -207,15 +205,34 @@ class Formulas(StateModel):
         return self._values(self._readings, x, k, {})
 
     def recorded(self, name: str, epochs: Sequence[int]) -> list[Recording]:
-        """Records formulas once, with k, t, inputs and constants as numbers of the epoch, so that
-        other values of these need no other machine code."""
-        formulas = self._transitions if name == "transition" else self._readings
-        by_epoch = {
-            **self._inputs,
-            **self._clock,
-            **{name: np.full(self.count, value) for name, value in self.constants.items()},
+        """Returns formulas, which are recorded once, with k, t, inputs and constants as numbers of
+        the epoch, so that other values of these need no other machine code."""
+        function, ties = self._recorded[name]
+        places = np.array(epochs)
+        return [Recording(function, places, self._numbers[places], ties)]
+
+    def recorded_numbers(self, name: str, epochs: Sequence[int]) -> Mapping[Any, Numbered]:
+        places = np.array(epochs)
+        return {None: Numbered(places, self._numbers[places])}
+
+    @property
+    def _numbers(self) -> Array:
+        """What recorded formulas take of each epoch (K, p), behind the states."""
+        constants = [np.full(self.count, value) for value in self.constants.values()]
+        columns = [*self._inputs.values(), *self._clock.values(), *constants]
+        return np.stack(columns, axis=1, dtype=float)
+
+    @cached_property
+    def _recorded(self) -> dict[str, tuple[RowFunction, RowFunction | None]]:
+        """Transition and readings as functions of states and `_numbers`, with their ties."""
+        return {
+            "transition": self._record(self._transitions),
+            "observe": self._record(self._readings),
         }
+
+    def _record(self, formulas: Mapping[str, Arithmetic]) -> tuple[RowFunction, RowFunction | None]:
         graph = Graph()
+        by_epoch = (*self._inputs, *self._clock, *self.constants)
         known = {name: graph.input(name) for name in (*self.next, *by_epoch)}
         x = [known[name] for name in self.next]
         c = [known[name] for name in by_epoch]
@@ -226,23 +243,30 @@ class Formulas(StateModel):
         y = [graph.apply("add", formula(values), 0.0) for formula in formulas.values()]
         needed = set(in_order(y)) & dependent(graph.ties, x)
         ties = [tie for tie in graph.ties if tie in needed]
-        function = RowFunction(RowPrograms.of(y, x, c))
         equal = RowFunction(RowPrograms.of(ties, x, c)) if ties else None
-        numbers = np.stack([*by_epoch.values()], axis=1, dtype=float)
-        places = np.array(epochs)
-        return [Recording(function, places, numbers[places], equal)]
+        return RowFunction(RowPrograms.of(y, x, c)), equal
+
+    def _with(self, options: Mapping[str, Any]) -> StateModel:
+        """Keeps what is read and recorded of the formulas."""
+        if type(self) is not Formulas:
+            return super()._with(options)
+        other = copy.copy(self)
+        for name, value in options.items():
+            object.__setattr__(other, name, Entries(value))
+        for name in ("_deviations", "_steady_gain"):
+            vars(other).pop(name, None)
+        return other
 
     @cached_property
     def _factors(self) -> _Factors:
         graph = Graph()
-        names = (*self.next, *self.inputs, *self._clock, *self.noise)
+        names = (*self.next, *self.inputs, *self._clock, *self.constants, *self.noise)
         known = {name: graph.input(name) for name in names}
-        values = {**self.constants, **known}
         w = [known[name] for name in self.noise]
         # G = df/dw, of which x = f(x, w) is linear.
         factors: list[Expression] = []
         for formula in self._transitions.values():
-            moved = graph.apply("add", formula(values), 0.0)
+            moved = graph.apply("add", formula(known), 0.0)
             factors += slopes(moved, w)
         return _Factors(known, factors)
 
@@ -256,7 +280,7 @@ class Formulas(StateModel):
 
     @cached_property
     def _program(self) -> Program:
-        """Computes the factors from the states, the inputs, k and t."""
+        """Computes the factors from the states, the inputs, k, t and the constants."""
         known, factors = self._factors
         inputs = [one for name, one in known.items() if name not in self.noise]
         return Program.of(factors, inputs)
@@ -271,12 +295,13 @@ class Formulas(StateModel):
             return self.gain(k)
         return self._factors_at(x, k) * self._noise_deviations
 
-    def _factors_at(self, x: Array, k: int) -> Array:
-        """Computes the factors (..., n, q) at states x (..., n)."""
+    def _factors_at(self, x: Array, k: int | Array) -> Array:
+        """Computes the factors (..., n, q) at states x (..., n) of an epoch, or at states (e, n) of
+        epochs k (e,)."""
         states = np.moveaxis(x, -1, 0)
-        inputs = [float(values[k]) for values in self._inputs.values()]
+        by_epoch = [values[k] for values in (*self._inputs.values(), *self._clock.values())]
         with np.errstate(all="ignore"):
-            factors = self._program([*states, *inputs, *self._at_epoch(k).values()])
+            factors = self._program([*states, *by_epoch, *self.constants.values()])
         # A factor that is the same in all states is one number, and becomes one for each.
         each = np.broadcast_arrays(x[..., 0], *factors)[1:]
         return np.stack(each, axis=-1).reshape(*x.shape, len(self.noise))
@@ -284,8 +309,19 @@ class Formulas(StateModel):
     def gain(self, k: int) -> Array:
         if self.gain_by_state:
             return super().gain(k)
-        by_epoch = {*self._clock, *self.inputs}
-        return self._gain(k) if self._named_by_next & by_epoch else self._steady_gain
+        return self._gain(k) if self._gain_by_epoch else self._steady_gain
+
+    def gains(self, epochs: Array) -> Array:
+        if self.gain_by_state or not self.noise:
+            return super().gains(epochs)
+        if not self._gain_by_epoch:
+            return np.repeat(self._steady_gain[None], len(epochs), axis=0)
+        x = np.repeat(self.prior.mean[None], len(epochs), axis=0)
+        return self._factors_at(x, epochs) * self._noise_deviations
+
+    @cached_property
+    def _gain_by_epoch(self) -> bool:
+        return not self._named_by_next.isdisjoint({*self._clock, *self.inputs})
 
     @cached_property
     def _steady_gain(self) -> Array:
@@ -316,6 +352,11 @@ class Formulas(StateModel):
             return np.diag(self._values(self._deviations, self.prior.mean, k, {}) ** 2)
         return np.diag([float(self.deviation[name]) ** 2 for name in self.readings])
 
+    def covariances(self, epochs: Array) -> Array:
+        if self._deviations:
+            return super().covariances(epochs)
+        return np.repeat(self.R(0)[None], len(epochs), axis=0)
+
     def _moved(self, x: Array, w: Array, k: int) -> Array:
         noise = dict(zip(self.noise, np.moveaxis(w, -1, 0), strict=True))
         return self._values(self._transitions, x, k, noise)
@@ -326,7 +367,8 @@ class Formulas(StateModel):
         """Evaluates formulas (..., number) at states x (..., n) at epoch k."""
         states = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True))
         inputs = {name: float(values[k]) for name, values in self._inputs.items()}
-        known = {**states, **noise, **inputs, **self.constants, **self._at_epoch(k)}
+        clock = {name: float(values[k]) for name, values in self._clock.items()}
+        known = {**states, **noise, **inputs, **self.constants, **clock}
         with np.errstate(all="ignore"):
             values = [formula(known) for formula in formulas.values()]
         # A formula without states is one number, and becomes one for each.

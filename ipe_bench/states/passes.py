@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -382,33 +383,36 @@ class _Together(Passes):
     def __init__(self, model: StateModel, kind: Kind) -> None:
         super().__init__(model, kind)
         K = model.epochs
-        moving = [k for k in range(K) if model.moves(k)]
-        gains = {k: model.gain(k) for k in moving}
-        noise = {k: factor(model.R(k)) for k in range(K)}
-        none = np.zeros((model.n, 0), dtype=bool)
-        G: Array = np.any([A != 0 for A in gains.values()], axis=0) if moving else none
-        R: Array = np.any([A != 0 for A in noise.values()], axis=0)
-        self.runs: list[_Run] = []
-        made: dict[tuple[int, int], tuple[_Form, Step, Array]] = {}
-        for k in range(K):
-            f = self.functions[0].at[k] if k in gains else None
-            h = self.functions[1].at[k]
-            moved = None if f is None else _programs(f)
-            read = _programs(h)
-            key = id(moved), id(read)
-            if key not in made:
-                form = _Form.of(self, moved, read, G, R)
-                made[key] = form, form.step(), np.zeros((1 + K, form.shared.size))
-            form, step, shared = made[key]
-            values = {"d": h.numbers[0], "R": noise[k][R]}
-            if f is not None:
-                values |= {"c": f.numbers[0], "G": gains[k][G]}
+        f, h = self.functions
+        moving = np.array([k for k in range(K) if model.moves(k)], dtype=int)
+        gains = model.gains(moving)
+        noise = factor(model.covariances(np.arange(K)))
+        G = (gains != 0).any(axis=0)
+        R = (noise != 0).any(axis=0)
+        gain_numbers = np.zeros((K, int(G.sum())))
+        gain_numbers[moving] = gains[:, G]
+        of_f, at_f = f.places(K)
+        of_h, at_h = h.places(K)
+        pairs = of_f * len(h.recordings) + of_h
+        made: dict[int, tuple[Step, Array]] = {}
+        for pair in np.unique(pairs).tolist():
+            here = np.flatnonzero(pairs == pair)
+            first = int(here[0])
+            moved = f.recordings[int(of_f[first])] if model.moves(first) else None
+            read = h.recordings[int(of_h[first])]
+            programs = None if moved is None else _programs(moved)
+            form = _Form.of(self, programs, _programs(read), G, R)
+            shared = np.zeros((1 + K, form.shared.size))
+            values = {"d": read.numbers[at_h[here]], "R": noise[here][:, R]}
+            if moved is not None:
+                values |= {"c": moved.numbers[at_f[here]], "G": gain_numbers[here]}
             for name, numbers in values.items():
-                shared[1 + k, form.shared.at[name]] = numbers
-            if self.runs and self.runs[-1].step is step:
-                self.runs[-1] = self.runs[-1]._replace(count=self.runs[-1].count + 1)
-            else:
-                self.runs.append(_Run(step, shared, 1 + k, 1))
+                shared[1 + here, form.shared.at[name]] = numbers
+            made[pair] = form.step(), shared
+        changes = np.flatnonzero(np.diff(pairs)) + 1
+        self.runs: list[_Run] = []
+        for first, end in pairwise([0, *changes.tolist(), K]):
+            self.runs.append(_Run(*made[int(pairs[first])], 1 + first, end - first))
 
     def there(self, z: Array, route: Route | None, carry: Array, shown: Array) -> None:
         each = z

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -15,9 +15,11 @@ from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
+from ipe_bench.basics.options import Finite
 from ipe_bench.real import logs as tracks
 from ipe_bench.report import progress
-from ipe_bench.states import Bootstrap, Formulas, Grid, Smoother, ekf
+from ipe_bench.states import Bootstrap, Filter, Formulas, Grid, Smoother, base, ekf, ukf
+from ipe_bench.states.along import functions_of
 
 NILE = """
 1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140
@@ -233,6 +235,75 @@ def test_a_maximum_whose_innovations_do_not_fit_is_no_answer():
     assert (one.verdict, one.passes) == ("wrong", False)
     assert one.fit_p > 0.1
     assert "find= ended at a maximum whose innovations do not fit" in one.message
+
+
+@dataclass(frozen=True)
+class Gained(ConstantVelocity):
+    """A model in Python whose transition has an option among its numbers."""
+
+    drag: Finite = 0.1
+
+    def transition(self, x, k):
+        return super().transition(x, k) - self.drag * np.abs(x) * x
+
+
+GAINED = Formulas(
+    next={"x": "a*abs(x) + u*dt + b*w"},
+    readings={"z": "b*x", "angle": "x + a"},
+    constants={"a": 0.8, "b": 2.0},
+    noise={"w": 1.0},
+    deviation={"z": "1 + b**2", "angle": 0.3},
+    inputs={"u": 0.7},
+    period={"angle": 6.283185307},
+    spread={"x": 2.0},
+    count=7,
+)
+
+
+@pytest.mark.parametrize("filter", [ekf(), ukf(), Filter(iterations=3)], ids=["ekf", "ukf", "iekf"])
+@pytest.mark.parametrize(
+    ("model", "numbers"),
+    [
+        (DAMPED, {"constants": {"a": 1.1}, "deviation": {"z": 0.2}}),
+        (DAMPED, {"noise": {"w": 0.0}}),
+        (GAINED, {"constants": {"a": -0.3, "b": 0.5}, "noise": {"w": 3.0}}),
+        (replace(GAINED, next={"x": "a*x + b*x*w"}), {"constants": {"a": 0.5, "b": 0.5}}),
+        (ConstantVelocity(count=9), {"deviation": 0.7}),
+        (Gained(count=9), {"drag": 0.01, "deviation": 0.7}),
+        (Gained(count=9), {"drag": 0.0}),
+    ],
+)
+def test_a_model_with_other_numbers_is_the_model_that_has_them(model, numbers, filter):
+    """Bit for bit: likelihood, means and covariances; and the model that it came from stays."""
+    z = model.draw(0, 3, 2).z
+    before = filter.track(model, z)
+    changed = {}
+    for name, value in numbers.items():
+        known = getattr(model, name)
+        changed[name] = {**known, **value} if isinstance(value, dict) else value
+    fast = filter.track(model.with_numbers(changed), z)
+    sure = filter.track(replace(model, **changed), z)
+    again = filter.track(model, z)
+    for part in ("log_likelihood", "mean", "covariance", "nis"):
+        np.testing.assert_array_equal(getattr(fast, part), getattr(sure, part))
+        np.testing.assert_array_equal(getattr(again, part), getattr(before, part))
+    assert not np.array_equal(fast.log_likelihood, before.log_likelihood)
+
+
+@pytest.mark.parametrize(
+    ("model", "find"), [(DAMPED, ["a", "w"]), (Gained(count=9), ["drag", "deviation"])]
+)
+def test_a_search_tries_the_functions_of_a_model_at_its_ends_alone(monkeypatch, model, find):
+    monkeypatch.setattr(tracks, "SEARCHES", 1)
+    tried = []
+    monkeypatch.setattr(base, "functions_of", lambda one: tried.append(one) or functions_of(one))
+    told = []
+    question = tracks.LogQuestion.of(model, model.draw(0, 1, 4).z[0], {"kf": ekf()}, find=find)
+    tried.clear()
+    question.track("kf", told.append)
+    assert len(told) > 20
+    # At the end, and where one number more is 0.
+    assert len(tried) <= 2
 
 
 @pytest.mark.parametrize(
