@@ -47,8 +47,7 @@ _LOWER = 1e-6
 """A chi-square that is smaller than at the estimate by more than this is that of a lower
 minimum."""
 _ON_BOUND = 1e-9
-"""A value nearer to a bound than this share of the start's distance is on the bound, but for
-round-off."""
+"""A value nearer to a bound than this share of it is on the bound, but for round-off."""
 
 
 def half_width(confidence: float, freedom: float | Array | None) -> float | Array:
@@ -72,6 +71,18 @@ def natural_limits(model: Measurement) -> tuple[Array, Array]:
     infinite = np.full(model.n, np.inf)
     ends = model.physical(np.stack([-infinite, infinite]))
     return ends.min(axis=0), ends.max(axis=0)
+
+
+def decades(model: Measurement, x: Array) -> Array:
+    """Returns how far (n,) parameters at x (n,) move by a factor of 10 in their distance to a
+    bound; infinite if they have none, or two."""
+    lower, upper = natural_limits(model)
+    bound = np.where(np.isfinite(lower), lower, upper)
+    value = model.physical(x[None])[0]
+    slope = model.physical_slope(x[None])[0]
+    with np.errstate(all="ignore"):
+        decade = np.log(10.0) * np.abs((value - bound) / slope)
+    return np.where(np.isfinite(lower) == np.isfinite(upper), np.inf, decade)
 
 
 def wald_interval(
@@ -152,7 +163,6 @@ def profiles(
         behind = freedom
     objective = objective_of(problem, z[None])
     least = float(objective.cost(x[None], objective.residual(x[None]))[0])
-    start = model.physical(model.nominal[None])[0]
     slope = model.physical_slope(x[None])[0]
     limits = natural_limits(model)
     found = []
@@ -183,8 +193,7 @@ def profiles(
         values = values if slope[k] > 0 else values[::-1]
         for bound in (limits[0][k], limits[1][k]):
             if np.isfinite(bound):
-                near = _ON_BOUND * abs(start[k] - bound)
-                values[np.abs(values - bound) <= near] = bound
+                values[np.abs(values - bound) <= _ON_BOUND * abs(bound)] = bound
         found.append(values)
     low, high = np.array(found).reshape(-1, 2).T
     return low, high
@@ -221,7 +230,7 @@ class _Side:
         """Finds the distance to the end; infinite if there is none, NaN if minima cannot be
         followed to it."""
         half = self.q * float(np.sqrt(self.P[self.place, self.place]))
-        decade = self._decade
+        decade = float(decades(self.problem.measurement, self.x)[self.place])
         # A logarithm of which nothing is known may have any standard error.
         half = min(half, 8 * decade)
         near = 0.0
@@ -249,18 +258,6 @@ class _Side:
             if far > _FARTHEST * half:
                 break
         return np.inf
-
-    @property
-    def _decade(self) -> float:
-        """A factor of 10 in the distance to the bound; infinite of a parameter without bounds."""
-        model = self.problem.measurement
-        lower, upper = (limits[self.place] for limits in natural_limits(model))
-        if np.isfinite(lower) == np.isfinite(upper):
-            return np.inf
-        bound = lower if np.isfinite(lower) else upper
-        value = model.physical(self.x[None])[0, self.place]
-        slope = model.physical_slope(self.x[None])[0, self.place]
-        return float(np.log(10.0) * np.abs((value - bound) / slope))
 
     def _crossing(self, near: float, far: float, precision: float) -> float:
         """Finds the distance between `near` and `far` at which the rise is q."""

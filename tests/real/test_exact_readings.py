@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+from scipy.stats import t as t_law
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula
+from ipe_bench.real.unlimited import limits_of
 from ipe_bench.report.page.answer import with_error
 
 LM = {"lm": LevenbergMarquardt()}
@@ -74,6 +77,7 @@ def test_as_many_readings_as_parameters_have_an_answer_with_noise_that_is_stated
         (-7.5e-10, 0.12, "-0.00 ± 0.12"),
         (2.877e6, 26000.0, "(2.877 ± 0.026)e6"),
         (0.3, 2.0, "0.3 ± 2.0"),
+        (0.0, 3.8e23, "0 ± 3.8e+23"),
         (1.2e-5, 3e-7, "(1.200 ± 0.030)e-5"),
     ],
 )
@@ -136,6 +140,29 @@ def test_parameters_that_run_off_together_have_no_standard_error(mirrored):
     assert tuple(one.endless) == (("c", "d"),)
     assert "c and d may go to infinity, so there is no standard error" in str(answer)
     assert "e+1" not in str(answer)
+
+
+@pytest.mark.parametrize("positive", [False, True])
+def test_parameters_on_their_way_to_infinity_have_a_limit_of_one_side(positive):
+    """Of Michaelis and Menten's curve where it is nearly straight: by a scan of the sum of squares,
+    in which V is linear."""
+    x = np.linspace(0.1, 2, 20)
+    z = 20 * x / (20 + x) + 0.3 * np.random.default_rng(0).standard_normal(20)
+    model = Formula("V*x/(K+x)", {"V": 1.0, "K": 1.0}, {"x": tuple(x.tolist())})
+    known = {name: {"positive": positive} for name in ("V", "K")}
+    (one,) = ib.estimate(model, z, LM, parameters=known)
+
+    def squares(K):
+        f = x / (K + x)
+        return np.sum((z - f * (f @ z) / (f @ f)) ** 2)
+
+    limit = squares(1e9) * (1 + t_law.ppf(0.975, 18) ** 2 / 18)
+    K = brentq(lambda K: squares(K) - limit, 0.1, 100)
+    f = x / (K + x)
+    found = limits_of(one)
+    assert one.x[0] > 1e6
+    assert found["K"] == pytest.approx(K, rel=1e-3)
+    assert found["V"] == pytest.approx(f @ z / (f @ f), rel=0.01)
 
 
 def test_a_model_that_may_vanish_is_open_where_all_readings_are_zero():

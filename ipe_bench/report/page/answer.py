@@ -25,6 +25,7 @@ from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import TOO_WELL, Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.real.search import LABEL as SEARCH
+from ipe_bench.real.unlimited import limits_of
 from ipe_bench.report.page.writer import write_files
 from ipe_bench.report.tables.table import (
     Fact,
@@ -426,6 +427,9 @@ def _notes(answer: Answer) -> Iterator[str]:
         if answer.passes and one.undetermined and not one.passes:
             what = "; ".join(one.undetermined)
             yield f"({one.label}: where it ended, the readings do not determine {what}.)"
+    told = [one for one in fits if math.isfinite(one.deviance)]
+    if told:
+        yield from _notes_on_limits(min(told, key=lambda one: one.deviance))
     yield from _notes_on_noise(answer)
     yield from _notes_on_priors(answer)
     if answer.model.fixed:
@@ -447,13 +451,11 @@ def _notes_on_fit(one: Fit) -> Iterator[str]:
     if one.beaten_by:
         yield (f"{one.label}: {one.beaten_by} found a significantly better fit; rejected.")
     for names, values in one.endless.items():
-        name = " and ".join(names)
-        if len(names) == 1:
-            why = f"with every value beyond {values[0]:.4g} the readings of the model are the same"
-        else:
-            at = _values(dict(zip(names, values, strict=True)), 4)
-            why = f"from {at} they can grow together, and the readings of the model stay the same"
-        yield f"{one.label}: {name} may go to infinity, so there is no standard error: {why}."
+        at = _values(dict(zip(names, values, strict=True)), 4)
+        yield (
+            f"{one.label}: {' and '.join(names)} may go to infinity, so there is no standard error:"
+            f" from {at} on the readings of the model stay the same."
+        )
     if one.lower_at:
         yield f"{one.label}: {one.lower_at} found a lower minimum; use that answer."
     for k, (low, high) in one.between.items():
@@ -470,6 +472,13 @@ def _notes_on_fit(one: Fit) -> Iterator[str]:
             f"{one.label}: on its bound: {_values(at)}; the readings favour a value beyond. It has"
             " no standard error; the others are computed with it fixed."
         )
+
+
+def _notes_on_limits(one: Fit) -> Iterator[str]:
+    """Says how far parameters that may go to infinity are from it at least."""
+    for name, value in limits_of(one).items():
+        side = "above" if value > 0 else "below"
+        yield f"{one.label}: the 95 % profile limits {name} to {side} {value:.3g}."
 
 
 def _notes_on_noise(answer: Answer) -> Iterator[str]:
