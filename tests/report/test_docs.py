@@ -323,13 +323,28 @@ def test_what_is_stored_is_what_the_program_computes_today(name, tmp_path):
 
 @pytest.mark.parametrize("page", WRITTEN, ids=ids)
 def test_links_lead_to_pages(page, generated):
-    for link in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
+    for link in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text(encoding="utf-8")):
         target = (page.parent / link).resolve()
         made = generated / target.relative_to(PAGES.resolve())
         drawings = word_drawings.DRAWINGS.get(page.parent.name, {})
         drawn = link in {f"pictures/{name}.png" for name in drawings}
         shown = drawn or link.startswith(("gallery/pictures/", "../gallery/pictures/"))
         assert target.exists() or made.exists() or shown, link
+
+
+def slug(heading: str) -> str:
+    """Returns the anchor of a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=ids)
+def test_links_lead_to_headings(page):
+    """Of written pages; the rows of checked.md are followed by test_oracles."""
+    for link, anchor in re.findall(r"\]\(([^)#]*)#([^)]+)\)", page.read_text(encoding="utf-8")):
+        target = (page.parent / link).resolve() if link else page
+        if target in WRITTEN and target.name != "checked.md":
+            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in [slug(one) for one in headings], f"{link}#{anchor}"
 
 
 def test_a_page_that_was_merged_leads_to_the_page_that_has_its_content(tmp_path):

@@ -69,7 +69,7 @@ SETTINGS = {
     "html_show_sourcelink": False,
     "html_static_path": [str(Path(__file__).parent / "static")],
     "html_css_files": ["site.css"],
-    "html_sidebars": {page: [] for page in ("first_hour", "choosing", "results", "tutorial")},
+    "html_sidebars": {page: [] for page in ("first_hour", "choosing", "results")},
     "html_math_renderer": "mathml",
     "html_theme_options": {
         "show_prev_next": False,
@@ -131,6 +131,8 @@ TABLES = "explanation/tables_of_states.md"
 CHECKED = "reference/checked.md"
 """The page of what is recorded of the tests that compare with a source."""
 MERGED = {
+    "explanation/calibration": "explanation/success",
+    "explanation/filters": "explanation/when_to_filter",
     "howto/agents": "howto/plugins",
     "howto/applications": "howto/hydra",
     "howto/completion": "howto/hydra",
@@ -139,6 +141,7 @@ MERGED = {
     "howto/sweeps": "howto/hydra",
     "howto/trials": "howto/hydra",
     "howto/write_statistic": "howto/write_noise",
+    "tutorial": "explanation/method",
 }
 """Pages of earlier versions, with the page that has their content now."""
 

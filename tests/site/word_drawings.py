@@ -23,12 +23,12 @@ BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#8a8a8a"
 
 
 def demand(t, b1=20.0, b2=0.5):
-    """Returns the oxygen demand of the tutorial."""
+    """Returns the oxygen demand of the first hour."""
     return b1 * (1 - np.exp(-b2 * t))
 
 
 def scenario(error_scale: float) -> ib.Scenario:
-    """Returns the tutorial's six readings, their truths drawn at an error scale."""
+    """Returns the first hour's six readings, their truths drawn at an error scale."""
     model = function(demand, columns={"t": DAYS})
     return ib.Scenario(model, ib.noise.Gaussian(NOISE), error_scale=error_scale)
 
