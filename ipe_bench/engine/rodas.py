@@ -256,6 +256,7 @@ class _Run:
         self.place = np.zeros(lanes, int)
         self.steps = np.zeros(lanes, int)
         self.stretch = np.zeros(lanes)
+        self.radius = np.zeros(lanes)
         self.fastest = np.zeros(lanes)
         self.met = np.zeros(lanes)
         self.z = np.full((equations.outputs, stop, lanes), np.nan)
@@ -300,6 +301,8 @@ class _Run:
             # Lanes whose error is too large stay where they are, and try the shorter step.
             self.steps[live] += 1
             done = live[good]
+            if self.stretched:
+                self.stretch[done] += self.radius[done] * now[good] / _REACH
             # A step that ends on a reading ends on its very time, whatever round-off adds.
             arrives = now[good] == left[good]
             there = self.times[self.place[done]]
@@ -375,7 +378,7 @@ class _Run:
         at = self._point(live)
         J = self._values("J", at, lanes).reshape(n, n, lanes)
         if self.stretched:
-            self._stretch(live, h, J)
+            self._stretch(live, J)
         # W = I / (h gamma) - J is factored once for all stages.
         W = -J
         W[range(n), range(n)] += 1 / (h * GAMMA)
@@ -436,12 +439,13 @@ class _Run:
                 D.append(_solve(W, exchanged, rest))
         return K, D
 
-    def _stretch(self, live: Array, h: Array, J: Array) -> None:
-        """Counts the steps that an explicit method would need here: it is stable while h |lambda|
-        stays below the reach of its stability region."""
+    def _stretch(self, live: Array, J: Array) -> None:
+        """Notes the spectral radius of J here: an explicit method is stable while h |lambda| stays
+        below the reach of its stability region."""
+        # From where J is not finite no step goes on.
         finite = np.nan_to_num(np.moveaxis(J, 2, 0), posinf=0.0, neginf=0.0)
         radius = np.abs(np.linalg.eigvals(finite)).max(axis=1)
-        self.stretch[live] += radius * h / _REACH
+        self.radius[live] = radius
         faster = live[radius > self.fastest[live]]
         self.met[faster] = self.t[faster]
         self.fastest[live] = np.maximum(self.fastest[live], radius)

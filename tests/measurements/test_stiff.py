@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from shared.oracles import assert_agrees
 from shared.slopes import differentiate
 
-from ipe_bench.engine.rodas import Rodas5P
+from ipe_bench.engine.rodas import _REACH, SHAPE, Rodas5P
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
 
 # fmt: off
@@ -50,8 +50,8 @@ def hires():
 def follower(**options):
     """A state that follows exp(-t / 100) with a time constant of 1 / k."""
     rates, outputs = {"w": "-0.01*w", "y": "-k*(y-w)"}, {"y": "y"}
-    options = {"start": {"k": 100.0}, "times": tuple(np.arange(0.0, 241.0, 10.0))} | options
-    return Ode(rates=rates, outputs=outputs, initial={"w": 1.0}, **options)
+    options = {"rates": rates, "start": {"k": 100.0}, "times": tuple(np.arange(0.0, 241.0, 10.0))} | options
+    return Ode(outputs=outputs, initial={"w": 1.0}, **options)
 
 
 # F. Mazzia and C. Magherini, Test Set for Initial Value Problem Solvers, release 2.4, Bari, 2008.
@@ -118,6 +118,15 @@ def test_a_stiff_model_is_found_and_is_within_its_tolerance():
         k - 0.01
     ) * t * np.exp(-k * t)
     assert_agrees(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
+
+
+def test_steps_of_an_explicit_method_are_counted_along_the_solution_alone():
+    """The Jacobian's spectral radius is k throughout, also where a pulse makes steps be refused."""
+    pulse = {"w": "-0.01*w", "y": "-k*(y-w) + 5000*exp(-((t-77)/0.5)**2)"}
+    model = follower(rates=pulse)
+    _, effort = Rodas5P(model.engine.stepped, SHAPE).measured(model.nominal[None])
+    assert effort.steps > 60
+    assert effort.explicit == pytest.approx(100.0 * 240.0 / _REACH, rel=1e-9)
 
 
 @pytest.mark.oracle("library: SciPy's Radau", "readings of Robertson's problem", 1e-7)
