@@ -194,8 +194,9 @@ class Recording:
         has been crossed."""
         side = self.graph.constant(0.0)
         for i, divisor in enumerate(self.divisors):
-            # Each divisor has a binary digit: 1 where it is negative.
-            side = side + 2.0**i * self.graph.apply("less", divisor, 0.0)
+            # Each divisor has a binary digit: 1 where it is negative. Beyond 50, whose sum a float
+            # holds exactly, divisors share digits, which add.
+            side = side + 2.0 ** (i % 50) * self.graph.apply("less", divisor, 0.0)
         return side
 
     @cached_property

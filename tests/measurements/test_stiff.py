@@ -120,6 +120,15 @@ def test_a_stiff_model_is_found_and_is_within_its_tolerance():
     assert_agrees(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
 
 
+@pytest.mark.parametrize("divisors", [3, 60, 130])
+def test_the_sign_of_each_of_many_divisors_tells_a_pole(divisors):
+    rates = {"y": "+".join(f"k/(y-{i})" for i in range(1, divisors + 1))}
+    model = Ode(rates=rates, start={"k": 1.0}, times=(1.0,))
+    y = np.arange(divisors + 1) + 0.5
+    (side,) = Rodas5P(model.engine.stepped, SHAPE)._programs["side"]([0.0, y, 1.0])
+    assert len(set(side)) == divisors + 1
+
+
 def test_steps_of_an_explicit_method_are_counted_along_the_solution_alone():
     """The Jacobian's spectral radius is k throughout, also where a pulse makes steps be refused."""
     pulse = {"w": "-0.01*w", "y": "-k*(y-w) + 5000*exp(-((t-77)/0.5)**2)"}
