@@ -65,7 +65,7 @@ class Minima:
 
     @classmethod
     def nowhere(cls, x: Array, history: bool) -> Minima:
-        """Returns marks every trial as without a minimum, at its start x (trials, n)."""
+        """Marks every trial as without a minimum, at its start x (trials, n)."""
         trials, n = x.shape
         far = np.full(trials, np.inf)
         return cls(

@@ -211,9 +211,9 @@ class Stages(Attempts):
         little."""
         owner = np.repeat(rows, _LOOKS)
         x = np.tile(self._points(k, wide=True), (len(rows), 1))
-        found = Minima.nowhere(x, False)
+        found = Minima.nowhere(x, self.limits.history)
         for steps, kept in _HALVINGS:
-            found = self.minimize(owner, _FROM_AFAR, found.x, steps)
+            found = continued(found, self.minimize(owner, _FROM_AFAR, found.x, steps))
             useless = np.full(len(owner), np.inf)
             chosen = _kept(owner, found.x, finite_or(np.inf, found.chi_square), useless, most=kept)
             found = take(found, chosen)

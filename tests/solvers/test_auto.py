@@ -154,6 +154,19 @@ CASES = {
     "sir": (Sir(), Gaussian(50.0), (1.0,)),
     "gins": (Gins(), Quantization(0.02286), (1.0, 33.0, 100.0, 300.0, 1000.0, 3000.0)),
 }
+def test_an_attempt_counts_all_iterations_that_led_to_its_end():
+    """One from several draws keeps the best of them again and again; its path shows each step."""
+    model = Formula("a*exp(-b*t)+c", {"a": 5.0, "b": 0.3, "c": 1.0}, {"t": tuple(range(8))})
+    scenario = Scenario(model, Gaussian(0.1))
+    z = scenario.draw(0, 3).z
+    attempts = Progressive()._attempts(scenario.problem.without_prior(), z, True)
+    rows = np.arange(3)
+    with np.errstate(all="ignore"):
+        found = attempts.attempt(6, rows, attempts.attempt(0, rows, None))
+    assert found.iterations.min() > 5
+    assert [len(path) - 1 for path in found.history] == found.iterations.tolist()
+
+
 OTHERS = (FixedPoint(), Newton(), GaussNewton(), LevenbergMarquardt(), Progressive())
 
 
