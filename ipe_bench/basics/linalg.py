@@ -285,13 +285,18 @@ def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
 
 
 def _by_orthogonal_factor(H: Array) -> tuple[Array, Mask]:
-    """Computes the pseudo-inverse of any H (trials, m, n), and where it has not full column
-    rank."""
+    """Computes the pseudo-inverse of any H (trials, m, n), and where it has not full column rank,
+    whatever the units of its columns."""
+    trials, m, n = H.shape
+    if m < n:
+        return np.full((trials, n, m), np.nan), np.ones(trials, dtype=bool)
     usable = finite(H)
-    Q, U = np.linalg.qr(np.where(usable[:, None, None], H, 0.0))
+    H = np.where(usable[:, None, None], H, 0.0)
+    # Powers of two, which change no digit.
+    size = 2.0 ** np.frexp(np.abs(H).max(axis=1))[1]
+    Q, U = np.linalg.qr(H / size[:, None])
     diagonal = np.abs(np.diagonal(U, axis1=1, axis2=2))
-    size = np.linalg.norm(U, axis=(1, 2))
-    floor = np.finfo(float).eps * max(H.shape[1:]) * size
+    floor = np.finfo(float).eps * m * np.linalg.norm(U, axis=(1, 2))
     deficient: Mask = ~usable | (diagonal.min(axis=1) <= floor)
     U = np.where(deficient[:, None, None], np.nan, U)
-    return solve(U, Q.swapaxes(1, 2))[0], deficient
+    return solve(U, Q.swapaxes(1, 2))[0] / size[:, :, None], deficient

@@ -24,7 +24,7 @@ def conditioned(condition: float, trials: int = 4) -> np.ndarray:
 
 
 @pytest.mark.parametrize("condition", [1.0, 20.0, 900.0, 3e3, 1e6, 1e10])
-@pytest.mark.parametrize("units", [1.0, 1e9])
+@pytest.mark.parametrize("units", [1.0, 1e9, 1e40])
 def test_a_pseudo_inverse_loses_no_more_digits_than_its_matrix(condition, units):
     """Round-off of eps times the condition, from normal equations that squared; whatever units the
     columns have."""
@@ -69,6 +69,13 @@ def test_a_matrix_without_full_rank_spoils_its_own_trial_only():
     assert deficient.tolist() == [False, True, True]
     np.testing.assert_array_equal(found[:1], pseudo_inverse(H[:1], R)[0])
     assert np.isnan(found[1:]).all()
+
+
+def test_fewer_readings_than_parameters_have_no_full_rank():
+    found, deficient = pseudo_inverse(np.ones((2, 3, 4)), Covariance(np.ones(3)))
+    assert found.shape == (2, 4, 3)
+    assert np.isnan(found).all()
+    assert deficient.all()
 
 
 def test_a_factor_is_refused_where_too_few_digits_are_left():
