@@ -104,9 +104,10 @@ def measured(
         size = np.maximum(np.abs(here), np.maximum(np.abs(up), np.abs(down)))
         coarse = 2 * _resolution(moved) * size
         noise = np.fmax(coarse, 3 * _scatter(here, moved.beside)) / ahead
-        # A step that is a few units of round-off of x is no step along the direction.
+        # A step that is a few units of round-off of what it moves is no step along the direction.
+        moving = np.where(directions != 0, np.abs(x)[:, None], 0.0).max(axis=2)
         widest = np.abs(directions).max(axis=2)
-        blur = (_EPS * np.abs(x).max(axis=1)[:, None] / widest)[:, :, None] / ahead
+        blur = (_EPS * moving / widest)[:, :, None] / ahead
         sides = (
             ((up - down) / (ahead + behind), 2),
             ((up - here) / ahead, 1),
