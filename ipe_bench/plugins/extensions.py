@@ -45,8 +45,9 @@ def richer_models(scenario: Scenario) -> list[Measurement]:
             continue  # `ipe-bench list` tells of options that cannot be made
         if not isinstance(other, type(model)) or type(other) is type(model):
             continue
+        other = dataclasses.replace(other, **own)  # type: ignore[type-var]
         if other.nuisance_deviation.any():
-            found.append(dataclasses.replace(other, **own))  # type: ignore[type-var]
+            found.append(other)
     return found
 
 

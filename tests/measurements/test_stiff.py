@@ -50,7 +50,11 @@ def hires():
 def follower(**options):
     """A state that follows exp(-t / 100) with a time constant of 1 / k."""
     rates, outputs = {"w": "-0.01*w", "y": "-k*(y-w)"}, {"y": "y"}
-    options = {"rates": rates, "start": {"k": 100.0}, "times": tuple(np.arange(0.0, 241.0, 10.0))} | options
+    options = {
+        "rates": rates,
+        "start": {"k": 100.0},
+        "times": tuple(np.arange(0.0, 241.0, 10.0)),
+    } | options
     return Ode(outputs=outputs, initial={"w": 1.0}, **options)
 
 

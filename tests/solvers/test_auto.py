@@ -154,6 +154,8 @@ CASES = {
     "sir": (Sir(), Gaussian(50.0), (1.0,)),
     "gins": (Gins(), Quantization(0.02286), (1.0, 33.0, 100.0, 300.0, 1000.0, 3000.0)),
 }
+
+
 def test_an_attempt_counts_all_iterations_that_led_to_its_end():
     """One from several draws keeps the best of them again and again; its path shows each step."""
     model = Formula("a*exp(-b*t)+c", {"a": 5.0, "b": 0.3, "c": 1.0}, {"t": tuple(range(8))})

@@ -198,7 +198,6 @@ def test_trackers_that_are_named_are_all_that_an_experiment_runs():
     assert chosen()["ipls"] == IteratedSmoother(ukf(), Cubature())
 
 
-@pytest.mark.slow
 @dataclass(frozen=True)
 class Deceived(Tracker):
     """The Kalman filter with another process noise than the states have."""

@@ -5,6 +5,7 @@ import re
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import patch
 
 import numpy as np
@@ -17,6 +18,7 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import Gaussian
+from ipe_bench.plugins.extensions import richer_models
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.questions.design.answer import _findings, _further, design_parts
 from ipe_bench.questions.design.figure import draw_further
@@ -245,6 +247,27 @@ def test_a_richer_model_without_errors_is_refused():
         ib.UserError, match="errors: gins_richer has no errors besides the parameters"
     ):
         design(scenario(Gins(), NOISE, 33.0), errors=[RicherGins()], truths=1)
+
+
+@dataclass(frozen=True)
+class Crowded(Gins):
+    """Has an error of its own where readings follow each other closely."""
+
+    @property
+    def nuisance_deviation(self) -> Array:
+        return np.full(int(self.readings_per_case > 20), 0.1)
+
+
+@pytest.mark.parametrize(("readings", "found"), [(30, [Crowded]), (15, [])])
+def test_a_model_is_richer_if_it_has_errors_with_the_options_of_ones_own(readings, found):
+    option = SimpleNamespace(name="crowded", fault=None, config={})
+    home = "ipe_bench.plugins.extensions"
+    with (
+        patch(f"{home}.options", lambda group: [option]),
+        patch(f"{home}.construct", lambda config, where: Crowded()),
+    ):
+        richer = richer_models(scenario(Gins(readings_per_case=readings), NOISE, 33.0))
+    assert [type(one) for one in richer] == found
 
 
 @pytest.fixture(scope="module")
