@@ -9,18 +9,21 @@ from __future__ import annotations
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from shared.random_results import results
 
 from ipe_bench.report.figures import drawings
+from ipe_bench.report.figures.headline import MOST_CURVES, chosen
+from ipe_bench.report.figures.views import views
 from ipe_bench.report.finding import Finding
 from ipe_bench.report.paper import with_columns
-from ipe_bench.report.style import GREY, house_style
-from ipe_bench.report.tables.matrix import Matrix, opening
+from ipe_bench.report.style import BLACK, BOUND_COLOR, GREY, house_style
+from ipe_bench.report.tables.matrix import MATRIX, Matrix, opening
 from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.report.tables.table import Table, latex, markdown
 from ipe_bench.report.tables.terminal import summary_tables
@@ -61,6 +64,8 @@ def faults(seed: int, *, drawn: bool = False) -> Iterator[str]:
 
 
 def of_result(frame: Any, label: str, scale: float) -> Any:
+    if frame.empty:
+        return frame
     return frame[(frame["estimator"] == label) & (frame["error_scale"] == scale)]
 
 
@@ -148,58 +153,195 @@ def torn_verdicts(analysis: Analysis) -> Iterator[str]:
             yield "a verdict of few"
         if not (np.isnan(low) or low <= row["nees_mean"] * (1 + 1e-9)):
             yield "the number lies below its interval"
+        last = of_result(analysis.tracks, row["estimator"], row["error_scale"])[-1:]
+        judged = len(last) and row["claims"] >= FEW
+        if judged and not np.allclose(last["nees_solved"], row["nees_mean"]):
+            yield "tracks: the last NEES is not the one that is judged"
 
 
 # Figures ------------------------------------------------------------------------------------------
 
 
-def curves_of(ax: Any) -> dict[str, np.ndarray]:
-    """Returns the points of the curves of a panel that are named, by name."""
-    found: dict[str, list[Any]] = {}
-    for line in ax.lines:
-        name = str(line.get_gid() or "").partition("#")[0].removeprefix("name:")
-        if name and len(line.get_xdata()):
-            found.setdefault(name, []).append(np.array([line.get_xdata(), line.get_ydata()], float))
-    return {name: np.concatenate(parts, axis=1) for name, parts in found.items()}
-
-
 def helped_in_figures(was: Analysis, now: Analysis, label: str, scale: float) -> Iterator[str]:
     with house_style():
         first, second = ({d.name: d for d in drawings(one, "all")} for one in (was, now))
-    for drawing in (*first.values(), *second.values()):
-        for ax in drawing.figure.axes:
-            named = [text.get_text() for text in ax.get_yticklabels() if text.get_text()]
-            if len(set(named)) < len(named) and drawing.name == "headline":
-                yield f"{drawing.name}: names look alike"
-            looks = Counter(
-                (line.get_color(), line.get_marker(), line.get_linestyle(), line.get_label())
-                for line in ax.lines
-                if line.get_gid() and line.get_color() != GREY and len(line.get_xdata()) > 1
-            )
-            if looks and max(looks.values()) > 1 and drawing.name == "headline":
-                yield f"{drawing.name}: curves look alike"
+    for analysis, shown in ((was, first), (now, second)):
+        for drawing in shown.values():
+            yield from alike_in(drawing)
+        yield from cut_where_it_falls(shown, analysis)
+    for name in first.keys() & second.keys():
+        axes = zip(first[name].figure.axes, second[name].figure.axes, strict=False)
+        if name == "headline":
+            yield from helped_curves(axes, label)
+        if name == "distributions":
+            yield from helped_distributions(axes, was, now, label)
+    yield from helped_places(was, now, label)
     cost = [one.get("cost_against_accuracy") for one in (first, second)]
     if all(cost):
         told = [re.search(r"Cheapest .*: (.*), [^,]* simulations", d.caption) for d in cost]
         if told[1] and told[1][1] == label and not (told[0] and told[0][1] == label):
             yield "cost_against_accuracy: named the cheapest by failing"
+        places = [costly_places(d, one, label) for d, one in zip(cost, (was, now), strict=True)]
+        if any(b < a * (1 - 1e-9) for a, b in zip(*places, strict=False)):
+            yield "cost_against_accuracy: a point falls"
     if "tracks" in first and "tracks" in second:
-        titles = [[ax.get_title() for ax in d["tracks"].figure.axes] for d in (first, second)]
-        order = [[title.partition(": ")[2] for title in some] for some in titles]
-        short = next((t for t in order[0] if label.startswith(t.rstrip("…")[:30])), None)
-        if short in order[1] and order[1].index(short) < order[0].index(short):
+        panels = [panel_of(d["tracks"], label) for d in (first, second)]
+        if panels[1] and (panels[0] is None or panels[1][0] < panels[0][0]):
             yield "tracks: a panel moves forward"
-    for analysis, shown in ((was, first), (now, second)):
-        totals = analysis.totals
-        every = sorted(set(totals["error_scale"]))
-        if len(every) < 2 or "headline" not in shown:
+        if panels[0] and panels[1]:
+            a, b = (panel.lines[0].get_ydata() for _, panel in panels)
+            ends = [panel.get_ylim()[1] for _, panel in panels]
+            seen = (a < min(ends)) & (b < min(ends))
+            if (b[seen] < a[seen] * (1 - 1e-9)).any():
+                yield "tracks: a curve falls"
+
+
+def alike_in(drawing: Any) -> Iterator[str]:
+    """Yields whether two panels, rows, names or curves of a drawing cannot be told apart."""
+    for ax in drawing.figure.axes:
+        rows = [tick.get_text() for tick in ax.get_yticklabels()]
+        places = [tick.get_text() for tick in ax.get_xticklabels()]
+        words = [one.get_text() for one in ax.texts if drawing.name != MATRIX]
+        for what, texts in (("rows", rows), ("places", places), ("names at curves", words)):
+            if twice(filter(None, texts)):
+                yield f"{drawing.name}: {what} look alike"
+        if twice(looks_of(line) for line in ax.lines if is_curve(line)):
+            yield f"{drawing.name}: curves look alike"
+    titles = [ax.get_title() for ax in drawing.figure.axes]
+    if twice(filter(None, titles)):
+        yield f"{drawing.name}: panels look alike"
+    labels = [one.get_text() for legend in drawing.figure.legends for one in legend.get_texts()]
+    if twice(labels):
+        yield f"{drawing.name}: entries of the legend look alike"
+
+
+def twice(things: Iterable[Any]) -> bool:
+    return max(Counter(things).values(), default=1) > 1
+
+
+def looks_of(line: Any) -> tuple[str, ...]:
+    """Returns what tells a curve from others."""
+    return str(line.get_color()), str(line.get_marker()), str(line._unscaled_dash_pattern)
+
+
+def is_curve(line: Any) -> bool:
+    """Whether a line is a curve of an estimator in colour, and no bound, truth or mark on it."""
+    background = (BOUND_COLOR, BLACK, GREY)
+    drawn = line.get_linestyle() != "None" and len(line.get_xdata()) > 1
+    return drawn and line.get_color() not in background
+
+
+def curve_of(ax: Any, label: str) -> np.ndarray | None:
+    """Returns the points (2, scales) of the curve of that name; a row has its value first."""
+    named = [line for line in ax.lines if str(line.get_gid()).startswith(f"name:{label}#")]
+    if not named:
+        return None
+    line = max(named, key=lambda line: len(line.get_xdata()))
+    return np.array([line.get_xdata(), line.get_ydata()], dtype=float)
+
+
+def helped_curves(axes: Any, label: str) -> Iterator[str]:
+    """Yields whether success rises or the error falls where both drawings have a scale."""
+    for (before, after), sign in zip(axes, (1, -1), strict=False):
+        curves = [curve_of(ax, label) for ax in (before, after)]
+        if curves[0] is None or curves[1] is None:
             continue
-        start = shown["headline"].figure.axes[0].get_xlim()[0]
-        cut = totals[totals["error_scale"] < start]
-        for _, here in cut.groupby("error_scale"):
-            apart = here["error_median"].max() > (1 + ALIKE) * here["error_median"].min() + 1e-9
+        across = int(not before.yaxis_inverted())
+        count = min(curve.shape[1] for curve in curves)
+        a, b = (curve[across][-count:] for curve in curves)
+        # A point that is not drawn is an error without end.
+        a, b = (np.nan_to_num(values, nan=0.0 if sign > 0 else 1e300) for values in (a, b))
+        if (sign * (b - a) > 1e-9 * np.abs(a)).any():
+            yield f"headline: {before.get_title()} improves"
+
+
+def helped_distributions(axes: Any, was: Analysis, now: Analysis, label: str) -> Iterator[str]:
+    look = looks_in(was)[label]
+    if GREY in (look.color, looks_in(now)[label].color):
+        return
+    for before, after in axes:
+        found = [
+            [
+                line
+                for line in ax.lines
+                if line.get_color() == look.color and line.get_marker() == look.marker
+            ]
+            for ax in (before, after)
+        ]
+        if [len(some) for some in found] != [1, 1]:
+            continue  # curves that look alike are a fault of their own
+        (a,), (b,) = ([np.array(one.get_data(), dtype=float) for one in some] for some in found)
+        grid = np.geomspace(*before.get_xlim(), 50)
+        shares = [np.interp(grid, x, y, left=0.0) for x, y in (a, b)]
+        if (shares[1] > shares[0] + 0.02).any():
+            yield "distributions: a curve rises"
+
+
+def looks_in(analysis: Analysis) -> Any:
+    (view,), _ = views(analysis)
+    return view.with_look(view.look)
+
+
+def helped_places(was: Analysis, now: Analysis, label: str) -> Iterator[str]:
+    """Yields whether an estimator moves forward in the matrix or among the curves of success."""
+    for name, most in (("success", 2), ("success", MOST_CURVES)):
+        orders = []
+        for analysis in (was, now):
+            (view,), _ = views(analysis)
+            orders.append(chosen(view.totals, view.families, most))
+        better = [set(order[: order.index(label)]) if label in order else None for order in orders]
+        if better[1] is not None and better[0] is not None and len(better[1]) < len(better[0]):
+            yield f"{name}: moves forward among {most} curves"
+
+
+def costly_places(drawing: Any, analysis: Analysis, label: str) -> list[float]:
+    """Returns the heights of an estimator's points, panel by panel; those beyond the axis stand at
+    its edge."""
+    one = looks_in(analysis)[label]
+    if one.color == GREY:
+        return []
+    found = []
+    for ax in drawing.figure.axes:
+        heights = [
+            float(offset[1])
+            for part in ax.collections
+            if to_hex(part.get_facecolor()[0]) == one.color
+            for offset in part.get_offsets()
+        ]
+        beyond = [line for line in ax.lines if line.get_markeredgecolor() == one.color]
+        found.append(heights[0] if len(heights) == 1 else 1e300 if beyond else np.nan)
+    return found
+
+
+def panel_of(drawing: Any, label: str) -> tuple[int, Any] | None:
+    """Returns the place and the panel of a tracker."""
+    for place, ax in enumerate(drawing.figure.axes):
+        if str(ax.lines[0].get_gid() if ax.lines else "").startswith(f"name:{label}#"):
+            return place, ax
+    return None
+
+
+def cut_where_it_falls(shown: Any, analysis: Analysis) -> Iterator[str]:
+    totals = analysis.totals
+    if len(set(totals["error_scale"])) < 2 or "headline" not in shown:
+        return
+    start = shown["headline"].figure.axes[0].get_xlim()[0]
+    cut = totals[totals["error_scale"] < start]
+    for _, here in cut.groupby("error_scale"):
+        for column in ("error_median", "error_q95"):
+            apart = here[column].max() > (1 + ALIKE) * here[column].min() + 1e-9
             if here["success"].min() < 0.995 or apart:
-                yield "headline: the axis cuts where a curve falls"
+                yield f"headline: the axis cuts where {column} falls"
+    for name, drawing in shown.items():
+        for ax in drawing.figure.axes:
+            low, high = sorted(ax.get_ylim())
+            for line in ax.lines:
+                if not is_curve(line) or name == "tracks" or not line.get_clip_on():
+                    continue
+                values = np.asarray(line.get_ydata(), dtype=float)
+                values = values[np.isfinite(values)]
+                if len(values) and (values.min() < low or values.max() > high):
+                    yield f"{name}: a curve leaves the panel"
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -236,8 +378,17 @@ def rows_of(found: Any) -> dict[str, Any]:
 
 if __name__ == "__main__":
     found: Counter[str] = Counter()
+    examples: dict[str, int] = {}
     first, last = (int(word) for word in sys.argv[1:3])
     for seed in range(first, last):
-        found.update(set(faults(seed, drawn=len(sys.argv) > 3)))
+        here = set(faults(seed, drawn=len(sys.argv) > 3))
+        examples |= {fault: seed for fault in here if fault not in examples}
+        found.update(here)
     print(f"{last - first} results")
-    print(*(f"{number:5} {fault}" for fault, number in found.most_common()), sep="\n")
+    print(
+        *(
+            f"{number:5} {fault}, first of seed {examples[fault]}"
+            for fault, number in found.most_common()
+        ),
+        sep="\n",
+    )

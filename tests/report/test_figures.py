@@ -35,6 +35,7 @@ from ipe_bench.report.figures import (
     parameters,
     settings,
 )
+from ipe_bench.report.figures.common import text, texts
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import View, focus_of, views
 from ipe_bench.report.style import (
@@ -1028,3 +1029,14 @@ def test_an_interval_that_leaves_the_panel_has_an_arrow_at_its_edge(ends, arrows
     assert sorted({y for _, y in cut_ends(ax)}) == arrows
     assert len(cut_ends(ax)) == len(SCALES) * len(arrows)
     assert all(0.0999 < y < 10.001 for segment in bars(ax) for y in segment[:, 1])
+
+
+def test_long_names_of_one_figure_are_told_apart_wherever_they_differ():
+    differ = [f"damped (metric=marquardt, alpha={a}, max_iterations=100, tol=1e-6)" for a in "12"]
+    for most in (16, 24, 42):
+        short = texts([*differ, "newton"], most)
+        assert len(set(short.values())) == 3
+        assert max(map(len, short.values())) <= most
+        assert short["newton"] == "newton"
+        assert text(differ[0]).startswith("damped")
+    assert texts(differ)[differ[0]] == "damped (me…alpha=1, max_iterations=100, t…"

@@ -96,3 +96,10 @@ def test_of_many_the_best_of_each_family_is_drawn_and_the_others_are_named():
 def test_the_title_is_the_finding_without_only():
     figure = picture(view(**FALLING))
     assert figure.texts[0].get_text() == "auto succeeds up to error scale 100"
+
+
+def test_curves_of_one_colour_differ_in_their_line_or_marker():
+    many = {f"e{i}": (10 - i,) * 2 for i in range(8)}
+    lines = picture(view(**many)).axes[0].lines
+    looks = {(line.get_color(), line.get_marker(), line._unscaled_dash_pattern) for line in lines}
+    assert len(looks) == len(lines) == 8

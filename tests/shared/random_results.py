@@ -23,8 +23,17 @@ LABELS = (
     "a_solver_with_a_long_name_and_options (max_iterations=10)",
     "a_solver_with_a_long_name_and_options (max_iterations=100)",
     "ekf",
+    "damped (metric=marquardt, alpha=0.1, max_iterations=100, tolerance=1e-6)",
+    "damped (metric=marquardt, alpha=0.2, max_iterations=100, tolerance=1e-6)",
+    "ukf",
+    "newton",
+    "fixed_point",
+    "mine",
 )
-FAMILIES = ("least squares", "IPE", "IPE", "IPE", "filters")
+FAMILIES = (
+    *("least squares", "IPE", "IPE", "IPE", "filters", "IPE", "IPE", "filters", "IPE", "IPE"),
+    "least squares",
+)
 Rows = dict[str, np.ndarray]
 
 
@@ -76,13 +85,13 @@ class Results:
 
 
 def results(seed: int) -> Results:
-    """Draws two to five estimators at one to four error scales."""
+    """Draws two to eleven estimators, mostly few, at one to four error scales."""
     rng = np.random.default_rng([seed, 50])
     moving = bool(rng.random() < 0.5)
     n = int(rng.integers(1, 4))
     trials = int(rng.choice([15, 30, 60]))
     scales = sorted(rng.choice([0.1, 1.0, 1.0000001, 10.0, 100.0], int(rng.integers(1, 5)), False))
-    labels = rng.permutation(len(LABELS))[: int(rng.integers(2, 6))]
+    labels = rng.permutation(len(LABELS))[: int(rng.choice([2, 3, 4, 5, 6, 11]))]
     kinds = rng.choice(["good", "falling", "random", "bad"], len(LABELS), p=[0.3, 0.4, 0.2, 0.1])
     groups = []
     rows = {}

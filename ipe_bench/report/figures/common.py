@@ -86,7 +86,8 @@ def panels(
 
 def name_axis(ax: Axes, names: Sequence[str]) -> None:
     """Sets names down the vertical axis; values stand on the horizontal one."""
-    ax.set_yticks(range(len(names)), [text(name) for name in names])
+    short = texts(names)
+    ax.set_yticks(range(len(names)), [short[name] for name in names])
     ax.set_ylim(len(names) - 0.4, -0.6)
 
 
@@ -140,11 +141,39 @@ def left_out(scales: Sequence[float], panels: Sequence[Any]) -> str:
 def text(value: Any) -> str:
     """Returns a name for use in a figure: never read as mathematics, never longer than a line. Of a
     longer one the beginning and the end stand, where options tell names apart."""
-    words = str(value)
-    most = 16 if print_width() else 42
-    if len(words) > most:
-        tail = words[-(most // 2) :].lstrip(_OF_NUMBERS)
-        words = f"{_cut(words, most - len(tail))}{tail}"
+    return texts([value])[str(value)]
+
+
+def texts(names: Iterable[Any], most: int = 0) -> dict[str, str]:
+    """Returns names for use in one figure, at most that long. Of longer ones that begin and end
+    alike the beginning stands, and the place where they differ."""
+    most = most or (16 if print_width() else 42)
+    whole = [str(name) for name in names]
+    short = {words: _ends(words, most) for words in whole}
+    for alike in set(short.values()):
+        same = [words for words in short if short[words] == alike]
+        if len(same) > 1:
+            letters = enumerate(zip(*same, strict=False))
+            at = next((i for i, here in letters if len(set(here)) > 1), len(min(same, key=len)))
+            short |= {words: _from(words, at, most) for words in same}
+    return {words: _plain(cut) for words, cut in short.items()}
+
+
+def _ends(words: str, most: int) -> str:
+    if len(words) <= most:
+        return words
+    tail = words[-(most // 2) :].lstrip(_OF_NUMBERS)
+    return f"{_cut(words, most - len(tail))}{tail}"
+
+
+def _from(words: str, at: int, most: int) -> str:
+    """Returns the beginning of a name and what stands in it from the word of that place on."""
+    begin = words[: most // 4]
+    start = max(words.rfind(" ", 0, at) + 1, at - most // 4)
+    return f"{begin}…{_cut(words[start:], most - len(begin) - 1)}"
+
+
+def _plain(words: str) -> str:
     words = words.replace(r"\$", "$").replace("$", r"\$")
     # A leading underscore would hide the name from legends.
     return f"\u200b{words}" if words.startswith("_") else words
@@ -157,7 +186,7 @@ def _cut(words: str, most: int) -> str:
             # Half a number would read as another one.
             kept = kept.rstrip(_OF_NUMBERS)
         words = f"{kept}…"
-    return words.replace("$", r"\$")
+    return words
 
 
 def _size(name: Any) -> float:
@@ -184,8 +213,12 @@ def _room(ax: Axes, size: str) -> float:
 
 def title(ax: Axes, words: str) -> None:
     """Sets the title of a panel, in one line."""
-    most = int(_room(ax, "axes.titlesize")) + 3
-    ax.set_title(_cut(words, max(12, most)))
+    ax.set_title(_cut(words, title_letters(ax)).replace("$", r"\$"))
+
+
+def title_letters(ax: Axes) -> int:
+    """Estimates how many letters fit a panel's title."""
+    return max(12, int(_room(ax, "axes.titlesize")) + 3)
 
 
 def axis_labels(fig: Figure, x: str, y: str) -> None:
@@ -536,6 +569,7 @@ def end_names(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look]) ->
     named = [name for name in look if name in last.index]
     ends = {name: _End(last["error_scale"][name], last[y][name]) for name in named}
     labels = _shared(ends)
+    short = texts(named)
     low, high = ax.get_ylim()
     size = _size("legend.fontsize")
     height = 72 * ax.figure.get_figheight() - _AROUND  # type: ignore[union-attr]
@@ -543,7 +577,7 @@ def end_names(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look]) ->
     wanted = [(end.value - low) / (high - low) for end in firsts]
     places = spread(wanted, 1.3 * size / height, 0.0, 1.0)
     for names, end, place in zip(labels, firsts, places, strict=True):
-        words = _named(ax, names, look, size)
+        words = _named(ax, {name: short[name] for name in names}, look, size)
         box = AnnotationBbox(
             HPacker(children=words, pad=0, sep=0.3 * size, align="baseline"),
             end,
@@ -580,19 +614,21 @@ def _shared(ends: Mapping[str, _End]) -> list[list[str]]:
     return labels
 
 
-def _named(ax: Axes, names: Sequence[str], look: Mapping[str, Look], size: float) -> list[Any]:
-    """Returns the names of a label, each in its curve's colour and bold where that line is."""
+def _named(ax: Axes, names: Mapping[str, str], look: Mapping[str, Look], size: float) -> list[Any]:
+    """Returns the texts of the names of a label, each in its curve's colour and bold where that
+    line is."""
     from matplotlib.offsetbox import TextArea
 
     words = []
-    for name in names:
+    *_, last = names
+    for name, short in names.items():
         one = look[name]
         color = SOFT if one.color == GREY else strong(one.color)
         style: Any = {"color": color, "fontsize": size}
         if one.width > 1:
             style["fontweight"] = "bold"
-        comma = "" if name == names[-1] else ","
-        words.append(TextArea(f"{text(name)}{comma}", textprops=style))
+        comma = "" if name == last else ","
+        words.append(TextArea(f"{short}{comma}", textprops=style))
         mark_name(ax, words[-1].get_children()[0], name, _TEXT)
     return words
 
@@ -610,11 +646,12 @@ def legend(
 
     on_axes = any(_value(ax) == "x" for ax in axes)
     named = {} if on_axes else look or {}
+    short = texts(named)
     colored = {label: one for label, one in named.items() if one.color != GREY}
     plain: dict[str, Any] = {"linestyle": "none"} if points else {}
     handles: dict[str, Any] = {}
     for label, one in colored.items():
-        handles[text(label)] = Line2D([], [], **one.line | plain)
+        handles[short[label]] = Line2D([], [], **one.line | plain)
     others = len(named) - len(colored)
     if others:
         handles[f"{others} others"] = Line2D([], [], color=GREY)

@@ -25,6 +25,7 @@ LEAST_DISTANCE = 1e-10
 """Distances from the limit below this are drawn here: round-off."""
 MANY_ITERATIONS = 60
 """Iterations from which on the axis is logarithmic."""
+_LOGARITHMIC = ", logarithmic from 10"
 
 
 def draw_costs(view: View) -> Iterator[Drawing]:
@@ -128,8 +129,9 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
     shown = colored_first[: common.most_panels()]
     fig, axes = common.panels(len(shown), by_scale)
     ends = (distance.min() / 3, distance.max() * 3)
+    short = common.texts(shown, common.title_letters(axes[0]) - len(_LOGARITHMIC))
     for label, ax in zip(shown, axes, strict=True):
-        _approach(ax, rows[rows["estimator"] == label], by_scale, label)
+        _approach(ax, rows[rows["estimator"] == label], by_scale, short[label])
         ax.set_ylim(*ends)
         common.log_ticks(ax.yaxis, *ends)
     common.axis_labels(fig, "iteration", "distance to own limit [σ]")
@@ -159,7 +161,7 @@ def _approach(ax: Any, rows: pd.DataFrame, by_scale: Mapping[str, Look], label: 
     ax.set_xlim(-0.03 * end - 0.2, 1.03 * end + 0.2)
     if end > MANY_ITERATIONS:
         ax.set_xscale("symlog", linthresh=10)
-        common.title(ax, f"{label}, logarithmic from 10")
+        common.title(ax, f"{label}{_LOGARITHMIC}")
     else:
         ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         common.title(ax, label)

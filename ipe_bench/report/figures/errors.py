@@ -141,12 +141,9 @@ def draw_panels(
     best = f"1: {view.reference}, a right covariance"
     words = {"heading": f"error over {view.reference}", "label": "median, bar to 95 %"}
     words |= {"most": CEILING["error_q95"], "interval": ("error_median", "error_q95")}
-    least = 0.5
     if view.moving:
         words["label"] = "over all epochs: median, bar to 95 %"
-        least = 0.01  # smoothers are far below the filter's bound
-    errors = capped[["error_median", "error_q95"]]
-    common.decades(error, errors.clip(lower=least), least=4.0)
+    common.decades(error, capped[["error_median", "error_q95"]], least=4.0)
     common.bound_line(error, 1.0, best)
     common.curves(error, rows, "error_median", *shown, **words)
     claims = rows[rows["nees_mean"].notna()]

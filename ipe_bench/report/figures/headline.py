@@ -38,7 +38,9 @@ SOFT = ("#57606a", "#9da7b1")
 LINE = ("#d8dee4", "#30363d")
 GROUND = (WHITE, DARK)
 DASHES: tuple[Any, ...] = ("-", (0, (4, 1.6)), (0, (1.2, 1.4)), (0, (6, 1.6, 1.2, 1.6)))
-"""Lines of the members of a family."""
+"""Lines of those of one colour."""
+MARKERS = "os"
+"""Markers of the first of one colour, and of those for whom no line is left."""
 _KNOWN = ("fixed_point", "ekf", "ukf", "levenberg_marquardt", REFERENCE)
 """Those whose curves are drawn after the best of each family, where not all have room."""
 _LETTERS = 15
@@ -62,6 +64,7 @@ class Curve:
     """The colour of its name, which is read: a contrast of 4.5."""
     dash: Any
     width: float
+    marker: str = "o"
 
 
 def draw(view: View) -> Iterator[Drawing]:
@@ -123,11 +126,12 @@ def _curves(names: list[str], families: Mapping[str, str], dark: bool) -> dict[s
         if at == 0:
             found[name] = Curve(INK[dark], INK[dark], "-", 5.0)
             continue
-        number = members.get(family, 0)
-        members[family] = number + 1
         color = FAMILY.get(family, GREY)[dark]
+        number = members.get(color, 0)
+        members[color] = number + 1
         letters = color if family in FAMILY else SOFT[dark]
-        found[name] = Curve(color, letters, DASHES[number % len(DASHES)], 2.6)
+        marker = MARKERS[number // len(DASHES)]
+        found[name] = Curve(color, letters, DASHES[number % len(DASHES)], 2.6, marker)
     return found
 
 
@@ -142,7 +146,7 @@ def _draw_curve(ax: Any, rows: pd.DataFrame, curve: Curve, ground: str) -> None:
     bars: Any = {"fmt": "none", "ecolor": curve.color, "elinewidth": 1.4, "alpha": 0.7}
     ax.errorbar(x[between], y[between], yerr=ends, **bars)
     line: Any = {"color": curve.color, "linewidth": curve.width, "linestyle": curve.dash}
-    line |= {"marker": "o", "markersize": curve.width + 3.4, "markeredgecolor": ground}
+    line |= {"marker": curve.marker, "markersize": curve.width + 3.4, "markeredgecolor": ground}
     ax.plot(x, y, markeredgewidth=1.2, clip_on=False, **line)
 
 
@@ -173,6 +177,7 @@ def _names(ax: Any, rows: pd.DataFrame, curves: Mapping[str, Curve]) -> None:
     low, high = ax.get_ylim()
     wanted = [(100 * last["success"][name] - low) / (high - low) for name in reversed(order)]
     height = 72 * _SIZE[1] * (_TOP - _BOTTOM)
+    short = common.texts(order)
     gap = 1.25 * _LETTERS / height
     places = common.spread(wanted, gap, 0.0, 1.0)
     for name, place in zip(reversed(order), places, strict=True):
@@ -182,7 +187,7 @@ def _names(ax: Any, rows: pd.DataFrame, curves: Mapping[str, Curve]) -> None:
         lead |= {"linewidth": min(curve.width, 2.0), "shrinkA": 3, "shrinkB": 4}
         lead |= {"relpos": (0.0, 0.5)}
         ax.annotate(
-            common.text(name),
+            short[name],
             end,
             (1.08, place),
             textcoords="axes fraction",

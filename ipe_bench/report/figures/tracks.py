@@ -34,12 +34,16 @@ def draw(view: View) -> Iterator[Drawing]:
     look = {label: view.look[label] for label in shown}
     fig, axes = common.panels(len(shown) + 1, look)
     ends = _ends(rows[rows["estimator"].isin(shown)])
+    told = {}
+    for label in shown:
+        kept = round(totals["success"][label] * totals["trials"][label])
+        told[label] = f"{kept} of {totals['trials'][label]:.0f} kept: "
+    longest = max(len(words) for words in told.values())
+    short = common.texts(shown, common.title_letters(axes[0]) - longest)
     for label, ax in zip(shown, axes, strict=False):
         _draw_errors(ax, rows[rows["estimator"] == label], look[label], ends)
-        kept = round(totals["success"][label] * totals["trials"][label])
-        # A long name is cut at its end.
-        common.title(ax, f"{kept} of {totals['trials'][label]:.0f} kept: {label}")
-    claiming = _draw_nees(axes[-1], rows, look)
+        common.title(ax, f"{told[label]}{short[label]}")
+    claiming = _draw_nees(axes[-1], rows, totals, look)
     common.axis_labels(fig, "time [s]", f"error over {view.reference}")
     axes[-1].set_ylabel("NEES / n")
     common.legend(fig, axes, look if claiming else None)
@@ -79,7 +83,8 @@ def _draw_errors(ax: Any, rows: pd.DataFrame, one: Look, ends: tuple[float, floa
     worst = rows["q90"].to_numpy(dtype=float)
     shade = (np.minimum(median, most), np.minimum(worst, most))
     ax.fill_between(at, *shade, color=one.color, alpha=0.2, linewidth=0)
-    ax.plot(at, np.minimum(median, most), color=strong(one.color), linewidth=1.6)
+    (line,) = ax.plot(at, np.minimum(median, most), color=strong(one.color), linewidth=1.6)
+    common.mark_name(ax, line, str(rows["estimator"].iloc[0]), 0)
     style: Any = {"color": BOUND_COLOR, "linestyle": BOUND_DASH, "linewidth": 1.0}
     ax.plot(at, rows["bound"], label=_BOUND, **style)
     ax.set_yscale("log")
@@ -87,9 +92,11 @@ def _draw_errors(ax: Any, rows: pd.DataFrame, one: Look, ends: tuple[float, floa
     common.log_ticks(ax.yaxis, *ends)
 
 
-def _draw_nees(ax: Any, rows: pd.DataFrame, look: dict[str, Look]) -> list[str]:
+def _draw_nees(
+    ax: Any, rows: pd.DataFrame, totals: pd.DataFrame, look: dict[str, Look]
+) -> list[str]:
     """Draws NEES over all states, with the limits that it keeps if covariances are right, of the
-    trackers that have enough trials to claim it; returns these."""
+    trackers that have enough trials to claim it, and the verdict's intervals; returns these."""
     known = rows[rows["estimator"].isin(list(look)) & rows["nees_solved"].notna()]
     common.title(ax, "NEES of solved trials")
     if known.empty:
@@ -99,8 +106,15 @@ def _draw_nees(ax: Any, rows: pd.DataFrame, look: dict[str, Look]) -> list[str]:
     low = known["nees_low_if_honest"].min()
     high = known["nees_high_if_honest"].max()
     common.band(ax, low, high, "95 % limits for a right covariance")
-    common.decades(ax, known["nees_solved"])
-    return list(dict.fromkeys(known["estimator"]))
+    claiming = list(dict.fromkeys(known["estimator"]))
+    judged = totals.loc[claiming]
+    common.decades(ax, known["nees_solved"], ends=judged[["nees_mean_low", "nees_mean_high"]])
+    for label, row in judged.iterrows():
+        ends = [row["nees_mean_low"], row["nees_mean_high"]]
+        # Of an interval without an upper end the lower half is drawn.
+        top = ends[1] if np.isfinite(ends[1]) else row["nees_mean"]
+        ax.vlines(known["at"].max(), ends[0], top, color=look[str(label)].color, linewidth=1.6)
+    return claiming
 
 
 def _claims(rows: pd.DataFrame, claiming: list[str]) -> str:
@@ -111,7 +125,8 @@ def _claims(rows: pd.DataFrame, claiming: list[str]) -> str:
         for label in claiming
         if firsts["claims"][label] < firsts["trials"][label]
     ]
-    return f"NEES: {enumerate_few(some, 8)}." if some else ""
+    bars = "Bars at the last epoch: the intervals of which verdicts are read." if claiming else ""
+    return f"{bars} NEES: {enumerate_few(some, 8)}." if some else bars
 
 
 FIGURES = (Figure(draw, ("summary", "tracks"), main=True),)
