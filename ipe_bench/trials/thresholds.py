@@ -9,6 +9,8 @@ SAME_ROOT = 1e-3
 """Two roots closer than this, in standard deviations of the Cramér-Rao bound, are one."""
 FIT_LEVEL = 1e-3
 """A model fits where residuals as large as these are no less probable than this."""
+DETECTED = 0.5
+"""Share of trials from which on a misfit counts as detected."""
 FEW = 20
 """Below this many trials a figure that is conditional on them has no interval, and no place on a
 curve unmarked."""

@@ -28,7 +28,7 @@ from ipe_bench.measurements import Recorded
 from ipe_bench.noise import Certified
 from ipe_bench.plugins import discovery
 from ipe_bench.report.finding import MEANING
-from ipe_bench.report.page.headline import about, headline, in_common, success
+from ipe_bench.report.page.headline import _hidden, about, headline, in_common, success
 from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.report.tables.table import Fact, Table
 from ipe_bench.report.words import percent
@@ -461,3 +461,23 @@ def test_a_fact_comes_back_from_another_process_as_it_was():
     again = pickle.loads(pickle.dumps(fact))
     assert (again, again.label, again.text) == (fact, fact.label, fact.text)
     assert again == "Price: simulations of a trial: 12"
+
+
+def test_the_hidden_model_error_is_the_most_harmful_of_those_that_tests_do_not_detect():
+    """By the best of the tests and estimators: one that any test detects is not hidden."""
+    settings = {"right model": (0.0, 1.0), "tilt": (0.02, 70.0), "walk": (0.9, 300.0)}
+    settings |= {"twist": (0.4, 5.0)}
+    rows = pd.DataFrame(
+        [
+            {"setting": name, "error_scale": 1.0, "misfit": seen * share, "error_median": error}
+            for name, (seen, error) in settings.items()
+            for share in (1.0, 0.1)
+        ]
+    )
+    (fact,) = _hidden(rows)
+    assert fact == (
+        "Hidden model error: the test of fit detects tilt in 2 % of the trials; the median error is"
+        " 70 times the bound."
+    )
+    # Without readings of the right model beside them there is nothing to blame a misfit on.
+    assert not list(_hidden(rows[rows["setting"] != "right model"]))

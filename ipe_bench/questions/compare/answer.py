@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -25,9 +25,20 @@ from ipe_bench.questions.compare.maths import (
     too_few,
 )
 from ipe_bench.report.page.writer import digests, write_files
-from ipe_bench.report.tables.table import Cell, Column, Part, Shown, Table, texts, words
+from ipe_bench.report.tables.table import (
+    Cell,
+    Column,
+    Fact,
+    Legend,
+    Part,
+    Shown,
+    Table,
+    texts,
+    words,
+)
 from ipe_bench.report.words import (
     compact,
+    counted,
     duration,
     enumerate_few,
     p_value,
@@ -53,8 +64,16 @@ _AS = {"success": "", "bias": ""}
 """What stands before a change: nothing before a difference, a sign before a ratio."""
 _FAILING = ("success", "error")
 """Quantities in which the second must not be worse, unless others are named."""
+_BY_P = (
+    "p comes from McNemar's exact test for success and sign-flip tests for the rest, with Holm's"
+    " correction over all tests."
+)
+_BY_EVIDENCE = "e-values stay valid under repeated looks; e = 20 is as rare as p = 0.05."
 _LEAST_P = 1e-6
 _MOST_EVIDENCE = 1000
+_INTERVAL = "interval"
+_MOST_SHOWN = 3
+"""Quantities whose values stand beside the picture."""
 
 
 class Comparison(Shown, pd.DataFrame):
@@ -63,9 +82,13 @@ class Comparison(Shown, pd.DataFrame):
     def parts(self) -> Iterator[Part]:
         """Yields a table per comparison, within 80 columns, and what the columns mean."""
         interval = f"{100 * (1 - self.attrs['alpha']):g} %"
+        anytime = self.attrs["anytime"]
+        unused = "p" if anytime else "e"
+        tests = _BY_EVIDENCE if anytime else _BY_P
         for title, rows in _comparisons(self):
             cells = [_cells(row, interval) for row in rows]
-            columns = [_column(name, [one[name] for one in cells]) for name in cells[0]]
+            names = [name for name in cells[0] if name != unused]
+            columns = [_column(name, [one[name] for one in cells]) for name in names]
             planned = [row for row in rows if row.get("power", math.nan) > 0]
             notes = [_needed(row) for row in planned]
             yield Table("comparison", title, "", columns, notes=notes)
@@ -73,9 +96,7 @@ class Comparison(Shown, pd.DataFrame):
             "error is the length of the error of all parameters, in standard deviations of the"
             " bound (Mahalanobis), at most the radius of the gate of success; cost counts"
             " simulations. Both are means over the common trials; the table of a run has medians,"
-            " and errors over the bound. p comes from McNemar's exact test for success and"
-            " sign-flip tests for the rest, with Holm's correction over all tests. e-values stay"
-            " valid under repeated looks; e = 20 is as rare as p = 0.05. Each interval holds"
+            f" and errors over the bound. {tests} Each interval holds"
             " for its row alone. Times are not tested. Between an estimator with a prior and one"
             " without, success is by the gate of the Cramér-Rao bound; in the table of a run each"
             " has the gate of its own bound."
@@ -101,33 +122,71 @@ def write_comparison(folder: Path, frame: Comparison, sources: Sequence[tuple[st
 
     parts = list(frame.parts())
     tables = [part for part in parts if isinstance(part, Table)]
-    sentences = parts[len(tables) :]
+    legends = [Legend(sentence) for sentence in parts[len(tables) :]]
+    compared = list(_comparisons(frame))
+    tested = frame[frame["p"].notna()]
+    lead = ""
+    if len(tested):
+        lead = (
+            "Better or worse: a significant change in the same trials, larger than a margin of"
+            f" {_margins(frame, tested['quantity'])}."
+        )
     write_files(
         folder,
         "comparison",
         ("comparison.csv", frame),
         finding(frame),
-        (),
-        [_joined(tables, [str(sentence) for sentence in sentences])],
+        list(_facts(compared)) if len(compared) == 1 else (),
+        [_joined(tables, legends)],
         draw_pairs(frame),
+        lead=lead,
+        facts=[counted(len(compared), "comparison")],
         sources=sources,
     )
+
+
+def _margins(frame: Comparison, quantities: Iterable[str]) -> str:
+    """Words the margins of these quantities."""
+    kinds = dict.fromkeys(quantity.partition(" ")[0] for quantity in quantities)
+    margins = frame.attrs["margins"]
+    return ", ".join(f"{_margin(kind, margins[kind])} in {kind}" for kind in kinds)
+
+
+def _margin(kind: str, margin: float) -> str:
+    if kind == "bias":
+        return f"{margin:g}"
+    unit = "%"
+    if kind == "success":
+        unit = "point" if 100 * margin == 1 else "points"
+    return f"{100 * margin:g} {unit}"
+
+
+def _facts(compared: Sequence[tuple[str, list[dict[str, Any]]]]) -> Iterator[Fact]:
+    """States what both have, of the only comparison that there is."""
+    ((heading, rows),) = compared
+    yield Fact("Compared", f"{heading}.")
+    for row in rows[:_MOST_SHOWN]:
+        cells = _cells(row, _INTERVAL)
+        told = f"{row['second']} {cells['second']}, {row['first']} {cells['first']}."
+        if row["second"] == row["first"]:
+            told = f"{cells['second']} after {cells['first']}."
+        yield Fact(cells[""].capitalize(), told)
 
 
 def _column(title: str, cells: Sequence[str]) -> Column:
     return words(title, cells) if title in _WORDS else texts(title, cells)
 
 
-def _joined(tables: Sequence[Table], sentences: Sequence[str]) -> Table:
+def _joined(tables: Sequence[Table], legends: Sequence[str]) -> Table:
     """Puts tables of the same columns below each other, their titles in a column, and below them
-    the sentences that say what the columns mean."""
+    what the columns mean."""
     titles = list(dict.fromkeys(column.title for table in tables for column in table.columns))
     names = [table.title for table in tables for _ in table.rows]
     columns = [words("comparison", names)]
     for title in titles:
         cells = [cell for table in tables for cell in _under(table, title)]
         columns.append(Column(title or "quantity", cells, title not in _WORDS))
-    notes = [*(note for table in tables for note in table.notes), *sentences]
+    notes = [*(note for table in tables for note in table.notes), *legends]
     return Table("comparison", "Trial by trial", "", columns, notes=notes, grouped=1)
 
 
@@ -143,7 +202,6 @@ def finding(frame: pd.DataFrame) -> str:
     """Says in what the second is better or worse by more than a margin: by how much in a single
     comparison, or else in how many."""
     rows: Any = frame[frame["p"].notna()].to_dict("records")
-    interval = f"{100 * (1 - frame.attrs['alpha']):g} %"
     by_quantity: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         by_quantity.setdefault(row["quantity"], []).append(row)
@@ -152,7 +210,7 @@ def finding(frame: pd.DataFrame) -> str:
         extents = []
         for each in by_quantity.values():
             found = [row for row in each if _said(row) == word]
-            extents += [_extent(found, len(each), interval)] if found else []
+            extents += [_extent(found, len(each))] if found else []
         if extents:
             clauses.append(f"{word} in {', '.join(extents)}")
     tested = [_TITLES.get(quantity, quantity) for quantity in by_quantity]
@@ -172,16 +230,15 @@ def _who(frame: pd.DataFrame) -> str:
     return "The second against the first"
 
 
-def _extent(found: Sequence[dict[str, Any]], number: int, interval: str) -> str:
+def _extent(found: Sequence[dict[str, Any]], number: int) -> str:
     """Says how large a change is, or in how many comparisons of its quantity it is found."""
     row = found[0]
     quantity = row["quantity"]
     title = _TITLES.get(quantity, quantity)
     if number > 1:
         return f"{title} ({len(found)} of {number} comparisons)"
-    cells = _cells(row, interval)
     sign = _AS.get(quantity.split()[0], "×")
-    return f"{title} ({sign}{cells['change']}; {interval}: {cells[interval]})"
+    return f"{title} ({sign}{_cells(row, _INTERVAL)['change']})"
 
 
 def _needed(row: dict[str, Any]) -> str:
@@ -326,6 +383,7 @@ def compared_folders(
     frame.attrs["notes"] = [*few, *left_out(ours, theirs), *other_sources(ours, theirs)]
     frame.attrs["margins"] = widened
     frame.attrs["alpha"] = alpha
+    frame.attrs["anytime"] = anytime
     if output is not None:
         write_comparison(Path(output), frame, read)
     return frame

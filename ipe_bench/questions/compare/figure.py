@@ -65,14 +65,17 @@ def draw_pairs(frame: pd.DataFrame) -> Iterator[Drawing]:
     labels = list(dict.fromkeys(names))
     kinds = list(dict.fromkeys(row["quantity"] for row in rows))[: common.most_panels()]
     look = dict.fromkeys(labels[:MOST_ROWS], Look(BOUND_COLOR, "o"))
-    fig, axes = common.panels(len(kinds), look, scales=[0.0], row=2)
-    fig.set_figwidth(print_width() or 10.4)
+    fig, axes = common.panels(len(kinds), look, scales=[0.0], row=1)
+    fig.set_figwidth(print_width() or 7.6)
     for kind, ax in zip(kinds, axes, strict=True):
         measure = _measure(kind, frame.attrs["margins"][kind.partition(" ")[0]])
-        for row, name in zip(rows, names, strict=True):
-            if row["quantity"] == kind and name in look:
-                _draw_change(ax, row, labels.index(name), measure)
+        named = [(row, name) for row, name in zip(rows, names, strict=True) if name in look]
+        shown = [(row, labels.index(name)) for row, name in named if row["quantity"] == kind]
+        for row, y in shown:
+            _draw_change(ax, row, y, measure)
         _set_axis(ax, measure)
+        for row, y in shown:
+            _mark_cut(ax, row, y, measure)
         common.title(ax, f"{kind}, {measure.words}")
     common.legend(fig, axes)
     caption = (
@@ -122,6 +125,16 @@ def _set_axis(ax: Axes, measure: _Measure) -> None:
     ax.set_xlim(min(low, measure.least), max(high, measure.most))
     common.band(ax, measure.least, measure.most, "smaller than the margin")
     ax.axvline(measure.same, color=BOUND_COLOR, linewidth=0.8, linestyle=":")
+
+
+def _mark_cut(ax: Axes, row: Any, y: int, measure: _Measure) -> None:
+    """Marks an interval that ends beyond the axis by an arrow at its edge."""
+    low, high = ax.get_xlim()
+    color = _COLORS.get(row["finding"], BOUND_COLOR)
+    if measure.factor * row["low"] < low:
+        common.mark_cut(ax, [y], low, color, downwards=True)
+    if measure.factor * row["high"] > high:
+        common.mark_cut(ax, [y], high, color, downwards=False)
 
 
 def _outcome(row: Any, low: float, high: float, measure: _Measure) -> str:

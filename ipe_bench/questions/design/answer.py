@@ -14,7 +14,18 @@ from ipe_bench.measurements.identifiability import structure
 from ipe_bench.plugins.extensions import richer_models
 from ipe_bench.questions.design.maths import Design, Further, Way, design, entry_in_words
 from ipe_bench.report.page.writer import write_files
-from ipe_bench.report.tables.table import Column, Part, Shown, Strong, Table, naming, texts, words
+from ipe_bench.report.tables.table import (
+    Column,
+    Fact,
+    Legend,
+    Part,
+    Shown,
+    Strong,
+    Table,
+    naming,
+    texts,
+    words,
+)
 from ipe_bench.report.words import enumerate_few, percent, scientific, short
 from ipe_bench.trials.observability import TRUTHS, Observability
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -48,7 +59,7 @@ def _best(design: Design) -> Way | None:
 
 def _direction(seen: Observability) -> str:
     start = "Worst-determined combination" if seen.observable else "The readings do not determine"
-    return f"{start}: {seen.words}"
+    return Fact(start, seen.words)
 
 
 def _no_others(design: Design) -> str:
@@ -97,7 +108,7 @@ def _further_findings(design: Design) -> Iterator[str]:
     two = f"at {where[1]} and {where[2]}"
     if where[1] == where[2]:
         two = f"twice at {where[1]}"
-    yield f"Then read {two}; {_fall(design, further, 1, 3)}"
+    yield Fact("Two more readings", f"{two}; {_fall(design, further, 1, 3)}")
 
 
 def _fall(design: Design, further: Further, before: int, after: int) -> str:
@@ -122,7 +133,7 @@ def _further(design: Design) -> Iterator[Table]:
         texts("smallest", [f"{share.min():.3f}" for share in shares]),
         words("of", [names[int(np.argmin(share))] for share in shares]),
     ]
-    note = (
+    note = Legend(
         f"Bounds are shares of today's at {_where(design)}. Each further reading is the one of the"
         " candidates that cuts the mean square of these shares most; an input's candidates reach to"
         " four times its range."
@@ -179,10 +190,12 @@ def _parameters(name: str, design: Design) -> Table:
         strongest = [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)]
         columns.append(words("strongest", strongest))
     s = seen.singular_values[0]
-    notes = [
-        "bound: smallest standard deviation of an unbiased estimator at the true values of"
-        f" {_where(design)}. Correlations of the errors there: multiple correlation with all"
-        " others, and the strongest with one other.",
+    notes: list[str] = [
+        Legend(
+            "bound: smallest standard deviation of an unbiased estimator at the true values of"
+            f" {_where(design)}. Correlations of the errors there: multiple correlation with all"
+            " others, and the strongest with one other."
+        ),
         f"Singular values of the whitened Jacobian, per parameter's size: {short(s[0])} to"
         f" {short(s[-1])}.",
     ]
@@ -195,8 +208,10 @@ def _parameters(name: str, design: Design) -> Table:
     if design.at is None:
         about = f"error scale {scenario.error_scale:g}"
         notes.append(
-            f"over the prior: median and quartiles of the bound at {len(design.x) - 1} true"
-            " parameters of this error scale."
+            Legend(
+                f"over the prior: median and quartiles of the bound at {len(design.x) - 1} true"
+                " parameters of this error scale."
+            )
         )
     setting = f"{name}, {scenario.noise.name}, {about}"
     title = f"{setting}: what {scenario.measurement.m} readings determine"
@@ -223,7 +238,7 @@ def _suspects(design: Design) -> Iterator[Part]:
     if not design.suspects:
         return
     shown = design.suspects[:_MOST_SUSPECTS]
-    note = (
+    note = Legend(
         f"detected: share of trials in which the test of fit at {FIT_LEVEL:g} reports the error."
         " An error is hidden if it makes a parameter wrong by more than its bound and is detected"
         " in less than half of the trials. The unseen direction barely changes the readings."
@@ -283,7 +298,7 @@ def _ways(design: Design) -> Iterator[Part]:
         "Which readings to take instead (bounds as shares of today's, criterion"
         f" {design.criterion})"
     )
-    note = (
+    note = Legend(
         f"fewest readings is the number whose bound is no larger than today's {today}. Chosen"
         " greedily from the candidates; a slightly better set may exist."
     )
@@ -310,14 +325,23 @@ def write_design(folder: Path, name: str, design: Design) -> list[Path]:
     columns = ["by", "choice", *index]
     table = pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
     title, *findings = _findings(design)
+    facts = [Fact("Hidden errors", sentence) for sentence in _unseen(design)]
+    for one in findings:
+        label, text = (one.label, one.text) if isinstance(one, Fact) else ("Choice", one)
+        facts.append(Fact(label, f"{text}."))
     return write_files(
         folder,
         "design",
         (READINGS, table),
         f"{name}: {title[0].lower()}{title[1:]}",
-        [*_unseen(design), *(f"{one}." for one in findings)],
+        facts,
         design_parts(name, design),
         _draw_design(design),
+        lead=(
+            "Bound: the smallest standard deviation that an unbiased estimator can have"
+            f" (Cramér-Rao), at {_where(design)}."
+        ),
+        facts=[f"{design.scenario.measurement.m} readings today"],
     )
 
 

@@ -18,8 +18,8 @@ from ipe_bench.questions.posterior.maths import (
     require_particles,
 )
 from ipe_bench.report.page.writer import write_files
-from ipe_bench.report.tables.table import Shown, Table, texts, words
-from ipe_bench.report.words import compact, enumerate_few, percent
+from ipe_bench.report.tables.table import Fact, Legend, Shown, Table, texts, words
+from ipe_bench.report.words import compact, counted, enumerate_few, percent
 
 if TYPE_CHECKING:
     from ipe_bench.estimators.base import Estimator
@@ -84,7 +84,7 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
 
 
 def _notes(found: Sequence[Reference]) -> Iterator[str]:
-    yield (
+    yield Legend(
         "divergence: KL divergence of the estimator's Gaussian from the moments of the posterior,"
         " in nats; noise: its value between two populations of particles, so a smaller divergence"
         " is chance. shift: difference of the means, in standard deviations of the posterior per"
@@ -138,9 +138,14 @@ def write_posteriors(
         "posterior",
         ("posterior.csv", pd.concat(frames)),
         f"{name}: {finding(found)}",
-        list(_unsettled(found)),
+        list(_facts(found)),
         posterior_parts(title, found),
         draw_marginals(model, found),
+        lead=(
+            "An estimate with its covariance is a Gaussian. Does it stand for the posterior, which"
+            " is sampled without linearisation?"
+        ),
+        facts=[counted(len(found), "trial")],
     )
 
 
@@ -159,16 +164,32 @@ def finding(found: Sequence[Reference]) -> str:
         f"{enumerate_few(by_count[count])} in {count} of {trials}"
         for count in sorted(by_count, reverse=True)
     ]
-    return f"estimates with an adequate Gaussian: {'; '.join(listed)}"
+    return f"the Gaussian stands for the posterior: {'; '.join(listed)}"
 
 
-def _unsettled(found: Sequence[Reference]) -> Iterator[str]:
-    number = sum(not one.posterior.settled for one in found)
-    if number:
-        yield (
-            f"In {number} of {len(found)} trials the posterior itself cannot be relied on; take"
-            " more particles."
+def _facts(found: Sequence[Reference]) -> Iterator[Fact]:
+    """States how far posteriors can be relied on, how many have one mode, and the largest
+    divergence of each estimator."""
+    settled = [one for one in found if one.posterior.settled]
+    unsettled = len(found) - len(settled)
+    if unsettled:
+        yield Fact(
+            "Particles",
+            f"in {unsettled} of {len(found)} trials the posterior itself cannot be relied on; take"
+            " more particles.",
         )
+    if not settled:
+        return
+    single = sum(len(one.posterior.modes) == 1 for one in settled)
+    yield Fact("A single mode", f"in {single} of {counted(len(settled), 'trial')}.")
+    worst = []
+    for label in settled[0].divergences:
+        largest = max(one.divergences[label].kl for one in settled)
+        worst.append(f"{label} {compact(largest)}")
+    yield Fact(
+        "Largest divergence, in nats",
+        f"{enumerate_few(worst, 4)}. Adequate: at most {ADEQUATE:g}, or twice the noise.",
+    )
 
 
 def sampled(

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from ipe_bench.report.style import Look
 
 
+FARTHEST = 4.5
+"""Standard deviations about the middle that a distribution is drawn to."""
+
+
 class _Gaussian(NamedTuple):
     x: Array
     """(n,)"""
@@ -86,7 +90,7 @@ def _worst(posterior: Posterior, claims: Iterable[_Gaussian]) -> Array:
 
 def _ends(posterior: Posterior, i: int, size: float) -> tuple[float, float]:
     """Returns the ends of the axis of a parameter, in its unit."""
-    reach = common.FARTHEST * posterior.deviation[i]
+    reach = FARTHEST * posterior.deviation[i]
     return size * (posterior.mean[i] - reach), size * (posterior.mean[i] + reach)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,14 +19,10 @@ from ipe_bench.report.finding import setting_words
 from ipe_bench.report.style import FAMILIES, WHITE, Look
 from ipe_bench.report.tables.settings import RIGHT, Wording, last_words
 from ipe_bench.report.words import brief, percent, value_text, varying
-
-if TYPE_CHECKING:
-    pass
+from ipe_bench.trials.thresholds import DETECTED
 
 MOST_ROWS = 25
 """Settings that have a row; the tables have all."""
-DETECTED = 0.5
-"""Share of trials from which on a misfit counts as detected."""
 _ALIKE = 0.05
 """Part by which the errors of estimators that are alike differ at most."""
 _MOST_ERROR = 1e4
@@ -36,9 +32,9 @@ _WIDTH = 4.4
 _LETTERS = 56
 """Length of a line above a row."""
 _COLORS = {
-    "right": FAMILIES["IPE"][3],
-    "detected": FAMILIES["least squares"][0],
     "undetected": FAMILIES["filters"][0],
+    "detected": FAMILIES["least squares"][0],
+    "right": FAMILIES["IPE"][3],
 }
 
 
@@ -99,20 +95,25 @@ def _swept(
 
 
 def _rows(view: View, rows: pd.DataFrame, scale: float) -> Iterator[Drawing]:
-    """Draws the error of the best estimator in a row for each setting, and writes above it in how
-    many trials the misfit is detected."""
+    """Draws the error of the best estimator as a bar for each setting, model errors that are not
+    detected first, and writes beside it in how many trials the misfit is detected."""
     errors = rows.pivot_table("error_median", "setting", "estimator")
     best = next((label for label in view.focus if label in errors), errors.columns[0])
     own = rows[rows["estimator"] == best].set_index("setting")
-    own = own.sort_values("error_median", ascending=False).iloc[:MOST_ROWS]
-    colors = [_COLORS[_kind(str(name), share)] for name, share in own["misfit"].items()]
-    look = {name: Look(color, "o") for name, color in zip(own.index, colors, strict=True)}
+    kinds = [_kind(str(name), share) for name, share in own["misfit"].items()]
+    own = own.assign(kind=kinds, order=[list(_COLORS).index(kind) for kind in kinds])
+    own = own.sort_values(["order", "error_median"], ascending=[True, False]).iloc[:MOST_ROWS]
+    look = {str(name): Look(_COLORS[kind], "o") for name, kind in own["kind"].items()}
     fig, (ax,) = common.panels(1, look, scales=[scale])
     common.decades(ax, own["error_median"].clip(upper=_MOST_ERROR), ends=own["error_q95"])
     common.bound_line(ax, 1.0, "1: the bound")
     ends: Any = {"interval": ("error_median", "error_q95"), "most": _MOST_ERROR}
     words: Any = {"by": "setting", "label": "error over the bound"}
     common.curves(ax, own.reset_index(), "error_median", look, [scale], **words, **ends)
+    bars = zip(own["error_median"].clip(upper=_MOST_ERROR), look.values(), strict=True)
+    for i, (error, one) in enumerate(bars):
+        bar: Any = {"color": one.color, "linewidth": 7.0, "alpha": 0.35}
+        ax.plot([1.0, error], [i, i], solid_capstyle="butt", zorder=1, **bar)
     ratios = errors.div(errors[best], axis=0)
     alike = len(errors.columns) > 1 and bool((abs(ratios - 1) <= _ALIKE).all(axis=None))
     common.title(ax, f"all {len(errors.columns)} estimators" if alike else best)
@@ -124,9 +125,9 @@ def _rows(view: View, rows: pd.DataFrame, scale: float) -> Iterator[Drawing]:
     yield view.drawing(
         fig,
         "settings",
-        f"Error by setting at error scale {scale:g}",
-        "Median error, bar to the 95 % quantile. Detected: the test of fit rejects the model, in %"
-        " of trials. Red: model error detected in under half of trials.",
+        f"Which model errors the test of fit detects, at error scale {scale:g}",
+        "Bar: median error over the bound; line: to the 95 % quantile. At the right: trials in"
+        " which the test rejects the model; red: under half.",
     )
 
 
@@ -137,8 +138,8 @@ def _kind(name: str, detected: float) -> str:
 
 
 def _write(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> int:
-    """Writes each error at its mark, and above each row its setting and in how many trials its
-    misfit is detected; returns the largest number of lines."""
+    """Writes each error at its mark, above each row its setting and beside it in how many trials
+    its misfit is detected; returns the largest number of lines."""
     most = 1
     for i, (name, one) in enumerate(look.items()):
         row: Any = rows.loc[name]
@@ -148,10 +149,13 @@ def _write(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> int:
         at = min(row["error_median"], _MOST_ERROR)
         if np.isfinite(at):
             ax.annotate(brief(row["error_median"]), (at, i), xytext=(0, -12), ha="center", **style)
-        told = f"{name}: detected in {percent(row['misfit'])}".replace(" %", "\u00a0%")
-        lines = textwrap.wrap(told, _LETTERS)
-        above: Any = {"xycoords": ("axes fraction", "data"), "xytext": (2, 6), "va": "bottom"}
+        lines = textwrap.wrap(str(name), _LETTERS)
+        place: Any = {"xycoords": ("axes fraction", "data")}
+        above: Any = {"xytext": (2, 8), "va": "bottom", **place}
         ax.annotate("\n".join(lines).replace("$", r"\$"), (0, i), **above, **style)
+        weight = "bold" if row["kind"] == "undetected" else "normal"
+        beside: Any = {"xytext": (6, 0), "va": "center", "fontweight": weight, **place}
+        ax.annotate(f"detected\n{percent(row['misfit'])}", (1, i), **beside, **style)
         most = max(most, len(lines))
     return most
 

@@ -100,7 +100,9 @@ def test_the_exact_gaussian_does_not_diverge_and_a_wrong_one_does_as_computed(li
     assert adequate_word(shifted, found) == "NO"
     divergences = {"exact": right, "half": confident, "shifted": shifted}
     one: Any = SimpleNamespace(posterior=found, divergences=divergences)
-    agreeing = "estimates with an adequate Gaussian: exact in {0} of {1}; half, shifted in 0 of {1}"
+    agreeing = (
+        "the Gaussian stands for the posterior: exact in {0} of {1}; half, shifted in 0 of {1}"
+    )
     assert finding([one]) == agreeing.format(1, "1 trial")
     assert finding([one, one]) == agreeing.format(2, "2 trials")
 
