@@ -363,10 +363,11 @@ class _Reader:
             )
         words = ["measurement=formula", f"measurement.expression={w.quoted(formula)}"]
         words += [f"measurement.start.{name}=1" for name in starts]
-        words += _reading_word(reading, ("y", "reading"))
+        words += _reading_word(reading, () if "y" in columns else ("y", "reading"))
         start = f"; start 1 for {enumerate_few(starts)}" if starts else ""
         start += _values({name: typed[name] for name in names if name in typed})
-        remedy = f"measurement.start.{(starts or names)[0]}=X sets another"
+        parameters = [name for name in names if name not in columns]
+        remedy = f"measurement.start.{parameters[0]}=X sets another"
         model = f"Model: {formula}{start}; {remedy}."
         return self._short(words, [model, self._told(columns, reading), self._noise()])
 

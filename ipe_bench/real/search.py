@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -25,6 +26,12 @@ from ipe_bench.real.fits import Fit, compared, fit, holding
 LABEL = "search"
 _AT_ONCE = 48
 """Values of a column that are tried together."""
+_FAR_APART = 12
+"""Values of a column that are tried for each of two parameters."""
+_SAME = 1e-9
+"""Share by which sums of squares of the same fit differ at most."""
+_ROUNDS = 12
+"""Times at most that a parameter is placed among the values of a column."""
 _MOST = 3
 """Lower minima that are taken one after another at most."""
 
@@ -80,43 +87,60 @@ def _with_steps(problem: Problem, z: Array, fits: list[Fit], noise: Noise) -> li
         return fits
     if any(one.passes for one in fits):
         return fits
-    ends = [end for place in best.idle for end in _along_columns(best, place)]
-    if not ends:
+    moved, between = _among_columns(best)
+    if not between:
         return fits
-    least = min(ends, key=lambda one: one.squares)
-    place = least.place
-    low, high = least.between
-    x = least.x
-    point = dict(zip([p.name for p in best.model.parameters], x.tolist(), strict=True))
+    names = [p.name for p in best.model.parameters]
+    point = dict(zip(names, moved.inner.tolist(), strict=True))
     (further,) = fit(problem, z, {LABEL: From(point)}, noise)
-    if further.idle:
-        if further.idle != (place,) or not _same_between(further, place, low, high):
+    steps = {place: between[place] for place in further.idle if place in between}
+    if len(steps) < len(further.idle):
+        return fits
+    if steps:
+        if not all(_same_between(further, place, *ends) for place, ends in steps.items()):
             return fits
         # The readings step there, and no slope tells where.
         if not isinstance(problem.measurement, ConstrainedModel):
             problem = replace(problem, measurement=ConstrainedModel(problem.measurement, ()))
-        middle = (low + high) / 2
-        (step,) = fit(holding(problem, {place: middle}), z, {LABEL: From(point)}, noise)
-        further = replace(
-            step, model=further.model, held_at={place: middle}, between={place: (low, high)}
-        )
+        middles = {place: (low + high) / 2 for place, (low, high) in steps.items()}
+        (held,) = fit(holding(problem, middles), z, {LABEL: From(point)}, noise)
+        further = replace(held, model=further.model, held_at=middles, between=steps)
     before = [replace(one, beaten_by="", lower_at="") for one in fits]
     return compared([*before, further])
 
 
-class _End(NamedTuple):
-    """Holds the least sum of squares with one parameter between two values of a column."""
+def _among_columns(best: Fit) -> tuple[Fit, dict[int, tuple[float, float]]]:
+    """Moves parameters that move no reading among the values of the columns, one after another and
+    again, while the sum of squares falls; returns the fit there, and the values between which each
+    lies."""
+    between: dict[int, tuple[float, float]] = {}
+    for _ in range(_ROUNDS):
+        ends = [end for place in best.idle for end in _along_columns(best, place)]
+        ends = ends or [end for pair in combinations(between, 2) for end in _in_pairs(best, *pair)]
+        if not ends:
+            break
+        least = min(ends, key=lambda one: one.squares)
+        between |= least.between
+        x = least.x
+        with np.errstate(all="ignore"):
+            h = best.assumed.measurement.simulate(x[None])[0]
+        residual = best.given.z - best.assumed.measurement.near(h, best.given.z)
+        best = replace(best, inner=x, residual=residual)
+    return best, between
 
-    place: int
+
+class _End(NamedTuple):
+    """Holds the least sum of squares with parameters between two values of a column each."""
+
     squares: float
     x: Array
-    between: tuple[float, float]
+    between: dict[int, tuple[float, float]]
 
 
 def _along_columns(best: Fit, place: int) -> list[_End]:
     """Finds the sums of squares that are less than that of the fit, each less than the one before,
     with one parameter between two values of a column."""
-    least = best.chi_square * (1 - 1e-9)
+    least = best.chi_square * (1 - _SAME)
     found = []
     for column in _columns(best.model):
         low = 0
@@ -125,17 +149,31 @@ def _along_columns(best: Fit, place: int) -> list[_End]:
         while high > low:
             gaps = np.unique(np.linspace(low, high - 1, _AT_ONCE).astype(int))
             middles = (column[gaps] + column[gaps + 1]) / 2
-            x, squares = _least_with(best, place, middles)
-            k = int(np.nanargmin(squares)) if np.isfinite(squares).any() else 0
+            x, squares = _least_with(best, (place,), middles[:, None])
+            k = int(np.argmin(squares))
             if squares[k] < least:
                 least = squares[k]
-                between = float(column[gaps[k]]), float(column[gaps[k] + 1])
-                found.append(_End(place, float(squares[k]), x[k], between))
+                between = {place: (float(column[gaps[k]]), float(column[gaps[k] + 1]))}
+                found.append(_End(float(squares[k]), x[k], between))
             if len(gaps) == high - low:
                 break
             low = gaps[max(k - 1, 0)]
             high = gaps[min(k + 1, len(gaps) - 1)] + 1
     return found
+
+
+def _in_pairs(best: Fit, first: int, second: int) -> Iterator[_End]:
+    """Finds a sum of squares that is less than that of the fit with two parameters between values
+    of a column that are far apart: one alone may not lead there."""
+    for column in _columns(best.model):
+        gaps = np.unique(np.linspace(0, len(column) - 2, _FAR_APART).astype(int))
+        one, other = np.meshgrid(gaps, gaps)
+        pairs = np.stack([one.ravel(), other.ravel()], axis=1)
+        x, squares = _least_with(best, (first, second), (column[pairs] + column[pairs + 1]) / 2)
+        k = int(np.argmin(squares))
+        if squares[k] < best.chi_square * (1 - _SAME):
+            ends = zip(column[pairs[k]].tolist(), column[pairs[k] + 1].tolist(), strict=True)
+            yield _End(float(squares[k]), x[k], dict(zip((first, second), ends, strict=True)))
 
 
 def _columns(model: Measurement) -> Iterator[Array]:
@@ -146,38 +184,39 @@ def _columns(model: Measurement) -> Iterator[Array]:
             yield values.astype(float)
 
 
-def _least_with(best: Fit, place: int, values: Array) -> tuple[Array, Array]:
-    """Minimises the sum of squares from the fit with one parameter at each of the values, and
-    returns where that led to (values, n), with the sums (values,)."""
+def _least_with(best: Fit, places: tuple[int, ...], values: Array) -> tuple[Array, Array]:
+    """Minimises the sum of squares from the fit with some parameters at values (sets, places), and
+    returns where that led to (sets, n), with the sums (sets,), infinite where there is none."""
     problem = best.assumed
-    x = _placed(best, place, values)
+    x = _placed(best, places, values)
     with np.errstate(all="ignore"):
         objective = Objective.of(problem, repeated(best.given.z, len(values)))
         limits = Limits(1e-6, 100)
         ended = minimize(objective, LevenbergMarquardtMethod(1e-3), x, limits)
         squares = np.sum(objective.residual(ended.x) ** 2, axis=1)
-    return ended.x, np.where(np.isfinite(x).all(axis=1), squares, np.inf)
+    return ended.x, np.where(np.isfinite(x).all(axis=1) & np.isfinite(squares), squares, np.inf)
 
 
-def _placed(best: Fit, place: int, values: Array) -> Array:
-    """Returns the fit's parameters (values, n) with one of them at each of the values; not finite
+def _placed(best: Fit, places: tuple[int, ...], values: Array) -> Array:
+    """Returns the fit's parameters (sets, n) with some of them at values (sets, places); not finite
     outside of its bounds."""
     model = best.assumed.measurement
     whole = model
     while isinstance(whole, WrappedModel) and not isinstance(whole, ConstrainedModel):
         whole = whole.whole
     own = model.physical(repeated(best.inner, len(values)))
-    own[:, place] = values
+    own[:, places] = values
     with np.errstate(all="ignore"):
         moved = whole.inner(own) if isinstance(whole, ConstrainedModel) else own / model.sizes
     x = repeated(best.inner, len(values))
-    x[:, place] = moved[:, place]
+    x[:, places] = moved[:, places]
     return x
 
 
 def _same_between(further: Fit, place: int, low: float, high: float) -> bool:
     """Tells whether readings are the same with one parameter anywhere between two values."""
-    x = _placed(further, place, low + (high - low) * np.linspace(0.001, 0.999, 5))
+    among = low + (high - low) * np.linspace(0.001, 0.999, 5)
+    x = _placed(further, (place,), among[:, None])
     with np.errstate(all="ignore"):
         h = further.assumed.measurement.simulate(x)
     return bool((h == h[0]).all())

@@ -26,6 +26,7 @@ FILES = {
     "bare.csv": "1,2\n3,4\n",
     "day.csv": "day,reading\n1,2\n2,3\n3,4\n",
     "volt.csv": "t [s],volt [V]\n0,1\n1,2\n2,3.5\n",
+    "circle.csv": "x,y,reading\n1,2,0\n3,4,0\n",
     "log.csv": "z\n1\n2\n3\n",
 }
 
@@ -49,6 +50,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         (["a*t+b", "line.csv"], "start 1 for a, b; measurement.start.a=X"),
         (["a*t+b", "line.csv", "measurement.start.b=-5"], "start 1 for a; start b = -5; meas"),
+        (["t*a+b", "line.csv", "measurement.start={a: 2, b: 3}"], "; measurement.start.a=X"),
         (["a*t+b", "line.csv", "measurement.start={a: 2, b: 3}"], "; start a = 2, b = 3; meas"),
         (["falling.py", "falling.csv", "measurement.start.v=-2"], "; start h = 10.0, v = -2."),
     ],
@@ -82,6 +84,11 @@ def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: s
             ["volt=a*t", "volt.csv"],
             "measurement=formula measurement.expression='a*t' measurement.start.a=1"
             " measurement.reading='volt' readings='volt.csv'",
+        ),
+        (
+            ["(x-a)^2+y^2", "circle.csv"],
+            "measurement=formula measurement.expression='(x-a)^2+y^2' measurement.start.a=1"
+            " measurement.reading='reading' readings='circle.csv'",
         ),
         (
             ["car.yaml", "readings=log.csv"],

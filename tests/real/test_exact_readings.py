@@ -74,8 +74,9 @@ def test_as_many_readings_as_parameters_have_an_answer_with_noise_that_is_stated
     [
         (5400011.0362, 0.0634, "5400011.036 ± 0.063"),
         (3.0, 3.8e23, "3 ± 3.8e+23"),
-        (-7.5e-10, 0.12, "-0.00 ± 0.12"),
+        (-7.5e-10, 0.12, "0.00 ± 0.12"),
         (2.877e6, 26000.0, "(2.877 ± 0.026)e6"),
+        (5000019966.0, 108.0, "5000019970 ± 110"),
         (0.3, 2.0, "0.3 ± 2.0"),
         (0.0, 3.8e23, "0 ± 3.8e+23"),
         (1.2e-5, 3e-7, "(1.200 ± 0.030)e-5"),
@@ -168,5 +169,5 @@ def test_parameters_on_their_way_to_infinity_have_a_limit_of_one_side(positive):
 def test_a_model_that_may_vanish_is_open_where_all_readings_are_zero():
     model = Formula("a*exp(-b*x)+c", dict.fromkeys("abc", 1.0), {"x": X})
     answer = ib.estimate(model, np.zeros(len(X)))
-    assert all(one.undetermined for one in answer)
+    assert answer["auto"].undetermined
     assert "The readings do not determine" in str(answer)

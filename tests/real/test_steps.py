@@ -32,6 +32,28 @@ def test_the_place_of_a_step_is_found_between_two_readings(known):
     assert "the same with every value from 19 to 20" in str(answer)
 
 
+@pytest.mark.parametrize("start", [(80.0, 90.0), (5.0, 6.0), (-3.0, 70.0)])
+@pytest.mark.parametrize("levels", [(1.0, 3.0, 2.0), (1.0, 3.0, 1.0)])
+def test_the_places_of_two_steps_are_found_one_after_the_other(levels, start):
+    """The least sum of squares over all pairs of places."""
+    truth = np.where(X < 20, levels[0], np.where(X < 41, levels[1], levels[2]))
+    z = truth + NOISE
+    starts = {"lo": 1.0, "mid": 1.0, "hi": 1.0, "s": start[0], "u": start[1]}
+    model = Formula("lo if x<s else (mid if x<u else hi)", starts, {"x": tuple(X.tolist())})
+    answer = ib.estimate(model, z, LM)
+
+    def squares(i, k):
+        return sum(np.var(part) * len(part) for part in (z[:i], z[i:k], z[k:]))
+
+    best = min((squares(i, k), i, k) for i in range(1, 59) for k in range(i + 1, 60))
+    assert best[1:] == (20, 41)
+    one = answer["search"]
+    assert answer.passes
+    assert one.between == {3: (19.0, 20.0), 4: (40.0, 41.0)}
+    assert one.chi_square * one.level**2 == pytest.approx(best[0], rel=1e-6)
+    assert one.x[:3] == pytest.approx([z[:20].mean(), z[20:41].mean(), z[41:].mean()], rel=1e-6)
+
+
 def test_a_bend_beyond_the_readings_is_found_among_them():
     bend = Formula(
         "b*x if x<s else b*s+c*(x-s)", {"b": 1.0, "c": 1.0, "s": 90.0}, {"x": tuple(X.tolist())}

@@ -65,6 +65,8 @@ _HIDDEN = 1e-3
 """Share of its error below which a value is written with figures of its own."""
 _MOST_FIGURES = 12
 """Figures beyond which two numbers are not written to one place."""
+_FEW_FIGURES = 4
+"""Figures up to which a large number is written with an exponent."""
 _MOST_READINGS = 5
 _NONLINEAR = "The model is strongly nonlinear"
 _MOST_MINIMA = 3
@@ -374,8 +376,14 @@ def _together(values: Sequence[float], between: str, place: int) -> str:
     power = math.floor(math.log10(largest or 10.0**place))
     if power - place > _MOST_FIGURES:
         return between.join(f"{v:.4g}" for v in values)
-    if largest >= 1e-4 and place >= -6 and (largest < 1e6 or place <= 0):
-        return between.join(f"{round(v, -place):.{max(-place, 0)}f}" for v in values)
+    if (
+        largest >= 1e-4
+        and place >= -6
+        and (largest < 1e6 or place <= 0 or power - place > _FEW_FIGURES)
+    ):
+        # Zero has no sign.
+        rounded = (round(v, -place) + 0.0 for v in values)
+        return between.join(f"{v:.{max(-place, 0)}f}" for v in rounded)
     figures = min(max(power - place, 0), 15)
     digits = [f"{Decimal(v).scaleb(-power):.{figures}f}" for v in values]
     return f"({between.join(digits)})e{power}"
@@ -423,7 +431,7 @@ def _notes(answer: Answer) -> Iterator[str]:
         if one.message:
             yield f"{one.label}: {one.message}"
     for one in fits:
-        yield from _notes_on_fit(one)
+        yield from _notes_on_fit(answer, one)
         if answer.passes and one.undetermined and not one.passes:
             what = "; ".join(one.undetermined)
             yield f"({one.label}: where it ended, the readings do not determine {what}.)"
@@ -445,19 +453,22 @@ def _labels(fits: Iterable[Fit]) -> str:
     return ", ".join(one.label for one in fits)
 
 
-def _notes_on_fit(one: Fit) -> Iterator[str]:
+def _notes_on_fit(answer: Answer, one: Fit) -> Iterator[str]:
     if one.label == SEARCH:
         yield f"{SEARCH}: Levenberg-Marquardt steps from the best of further starts."
-    if one.beaten_by:
-        yield (f"{one.label}: {one.beaten_by} found a significantly better fit; rejected.")
+    better = one.beaten_by or one.lower_at
+    if better and not answer[better].passes:
+        yield f"{one.label}: {better} met a lower sum of squares, but is no answer either."
+    elif one.beaten_by:
+        yield f"{one.label}: {better} found a significantly better fit; rejected."
+    elif better:
+        yield f"{one.label}: {better} found a lower minimum; use that answer."
     for names, values in one.endless.items():
         at = _values(dict(zip(names, values, strict=True)), 4)
         yield (
             f"{one.label}: {' and '.join(names)} may go to infinity, so there is no standard error:"
             f" from {at} on the readings of the model stay the same."
         )
-    if one.lower_at:
-        yield f"{one.label}: {one.lower_at} found a lower minimum; use that answer."
     for k, (low, high) in one.between.items():
         name = one.model.physical_parameters[k].name
         yield (
@@ -657,7 +668,9 @@ def _other_minima(found: Examination, names: Sequence[str]) -> Iterator[str]:
     """Says where chi-square is lower, and which parameters give the same readings."""
 
     def at(x: Array) -> str:
-        return _values(dict(zip(names, x, strict=True)), 5)
+        # What is round-off beside its error is zero.
+        known = np.where(np.abs(x) > _HIDDEN * found.standard_errors, x, 0.0)
+        return _values(dict(zip(names, known, strict=True)), 5)
 
     if not found.least:
         best = found.minima[0]
