@@ -18,7 +18,7 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import ModelNoise, Noise
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.plugins.construct import construct, instantiate, known_parameters
+from ipe_bench.plugins.construct import construct, known_parameters
 from ipe_bench.plugins.standard import of_run
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.report.formats import PAGE
@@ -202,40 +202,46 @@ DEFAULTS = {
 DEFAULTS |= {"estimators": {}, "trackers": {}}
 
 
-def spec(plain: Mapping[Any, Any]) -> Spec:
+def spec(config: Mapping[Any, Any]) -> Spec:
     """Constructs the job that a composed config describes."""
-    for key in plain:
+    for key in config:
         if key not in KEYS:
             raise UserError(f"{key}: {unknown(str(key), KEYS, 'key')}")
-    apart = ("estimators", "trackers", *PARTS)
-    made = {key: construct(value, key) for key, value in plain.items() if key not in apart}
+    for key in PARTS:
+        if key not in OPTIONAL or config.get(key) is not None:
+            _require_part(key, config.get(key))
+    chosen = "estimators" if config.get("state_model") is None else "trackers"
+    of_chosen = config[chosen] or {}
+    known = [one for one in plugins.options() if plugins.PACKAGES.get(one.group) == chosen]
+    for label, options in of_chosen.items():
+        _require_chosen(f"{chosen}.{label}", options, known)
+    whole = {**config, "estimators": {}, "trackers": {}, chosen: of_chosen}
+    parts = {key: construct(value, key) for key, value in whole.items()}
     for key, kind in PARTS.items():
-        config = plain.get(key)
-        if key in OPTIONAL and config is None:
-            made[key] = None
-        elif not isinstance(config, Mapping) or TARGET not in config:
-            raise UserError(
-                f"{key}={config}: is not a part that can be used; choose one, see `ipe-bench list`"
-            )
-        else:
-            made[key] = _of_kind(construct(config, key), key, kind)
-    made["trackers"] = {}
-    chosen = "estimators" if made["state_model"] is None else "trackers"
-    known = [option for option in plugins.options() if plugins.PACKAGES.get(option.group) == chosen]
-    labelled = {}
-    for name, options in (plain[chosen] or {}).items():
-        label = str(name)
-        labelled[label] = _labelled(chosen, label, options, known)
-    made["estimators"] = {label: pinned(one) for label, one in labelled.items()}
-    return instantiate(Spec, made, "")
+        if parts.get(key) is not None:
+            _require_kind(parts[key], key, kind)
+    made = parts[chosen]
+    for label, part in made.items():
+        _require_kind(part, f"{chosen}.{label}", Estimator if chosen == "estimators" else Tracker)
+    parts |= {"trackers": {}, "estimators": {label: pinned(part) for label, part in made.items()}}
+    return Spec(**parts)
 
 
-def _labelled(key: str, label: str, options: Any, known: Sequence[plugins.Option]) -> Any:
-    where = f"{key}.{label}"
+def _require_part(key: str, options: Any) -> None:
+    """Refuses what names no component, where one belongs."""
+    if not isinstance(options, Mapping) or TARGET not in options:
+        raise UserError(
+            f"{key}={options}: is not a part that can be used; choose one, see `ipe-bench list`"
+        )
+
+
+def _require_chosen(where: str, options: Any, known: Sequence[plugins.Option]) -> None:
+    """Refuses options of an estimator that is not chosen, and another under the name of one."""
+    label = where.partition(".")[2]
     if not isinstance(options, Mapping):
         raise UserError(f"{where}={options}: set its options, such as {where}.KEY=VALUE")
     if TARGET not in options:
-        keys = ", ".join(f"{where}.{key}" for key in options) or where
+        keys = ", ".join(f"{where}.{name}" for name in options) or where
         groups = {option.label: option.group for option in known}
         if label in groups:
             remedy = f"add it, as in {groups[label]}=[{label}]"
@@ -249,13 +255,10 @@ def _labelled(key: str, label: str, options: Any, known: Sequence[plugins.Option
             raise UserError(
                 f"{where}: is {options[TARGET]}, under the name of {name}; choose another label"
             )
-    kind = Estimator if key == "estimators" else Tracker
-    return _of_kind(construct(options, where), where, kind)
 
 
-def _of_kind(part: Any, key: str, kind: type) -> Any:
-    """Returns the part, if it is of the right kind and can be stored and sent to other
-    processes."""
+def _require_kind(part: Any, key: str, kind: type) -> None:
+    """Refuses a part of another kind, and one that cannot be stored or sent to other processes."""
     if not isinstance(part, kind):
         name = type(part).__name__
         raise UserError(
@@ -269,4 +272,3 @@ def _of_kind(part: Any, key: str, kind: type) -> Any:
             f"{key}: a field of {type(part).__name__} can be neither stored nor sent to a worker "
             f"({describe_exception(error)}); use numbers, texts, lists and components"
         ) from None
-    return part
