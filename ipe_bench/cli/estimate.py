@@ -16,10 +16,6 @@ from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.states.base import StateModel
 
 
-def _described(estimators: Any) -> dict[str, Any]:
-    return {label: describe(estimator) for label, estimator in estimators.items()}
-
-
 def estimate_command(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit
     passes."""
@@ -37,7 +33,7 @@ def estimate_command(arguments: Sequence[str]) -> int:
         "readings": readings,
         "scenario": describe(question.scenario),
         "prior": question.has_prior,
-        "estimators": _described(question.estimators),
+        "estimators": asked.estimators,
     }
     if question.ignored:
         command["left_out"] = list(question.ignored)
@@ -62,25 +58,20 @@ def standard_words(arguments: Sequence[str]) -> list[str]:
 def _track(asked: Single, model: StateModel) -> int:
     """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where
     no track passes."""
-    from ipe_bench.real.logs import LogQuestion
     from ipe_bench.report.page.log import NAME, TABLE, LogAnswer, store, write_page
 
-    asked.words.refuse(
-        ("error_scale",), "is of simulated trials; give the state model another prior"
-    )
     spec = asked.spec
-    trackers = spec.estimators
     find = spec.find or ()
-    question = LogQuestion.of(model, spec.readings, trackers, spec.ignored, find)
+    question = asked.log_question(spec.readings, find)
     command = {
         "readings": spec.readings,
         "find": find,
         "model": describe(model),
-        "trackers": _described(trackers),
+        "trackers": asked.estimators,
     }
     log = question.log
     files = [log.file] if log.file else []
-    provenance = _provenance(asked, files, [log.model, *trackers.values()])
+    provenance = _provenance(asked, files, [log.model, *spec.estimators.values()])
     drawn = spec.figures != "none"
     with asked.folder(NAME, command, [TABLE]) as folder:
         answer = LogAnswer.to(question, "lines")

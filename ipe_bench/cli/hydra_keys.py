@@ -93,16 +93,10 @@ def _size(node: yaml.Node | None, known: dict[yaml.Node, float]) -> float:
 def _leaves(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
     """Yields the values in a config, each with its key; empty lists and dictionaries are values,
     too."""
-    items = (
-        enumerate(node)
-        if isinstance(node, list)
-        else node.items()
-        if isinstance(node, dict)
-        else ()
-    )
-    if not items or not node:
+    if not node or not isinstance(node, list | dict):
         yield key, node
         return
+    items = enumerate(node) if isinstance(node, list) else node.items()
     for name, value in items:
         yield from _leaves(value, f"{key}.{name}".lstrip("."))
 

@@ -4,13 +4,13 @@ own."""
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import say_files, show
 from ipe_bench.cli.keys import of
+from ipe_bench.cli.own_data import question_on
 from ipe_bench.cli.shorts import Short
 from ipe_bench.cli.single import Single, single
 from ipe_bench.cli.words import TRUTH
@@ -66,17 +66,11 @@ def _folder(
     return asked.folder(NAME, known, (TABLE,))
 
 
-def _described(estimators: Any) -> dict[str, Any]:
-    return {label: describe(one) for label, one in estimators.items()}
-
-
 def _of_constants(asked: Single, files: list[str]) -> tuple[Own, AbstractContextManager[Path]]:
     from ipe_bench.questions.own.maths import own
 
     spec = asked.spec
-    answers = standard.constructed({"solver": ("auto",)})
-    fitting = replace(spec, readings=tuple(files), estimators=answers)
-    question = fitting.question(asked.words.keys).checked()
+    question = question_on(spec, files, asked.words.keys)
     affordable = max(_FEWEST, _MOST_READINGS // question.found.model.m)
     trials = spec.trials or min(_TRIALS, affordable)
     folder = _folder(
@@ -85,28 +79,22 @@ def _of_constants(asked: Single, files: list[str]) -> tuple[Own, AbstractContext
         files,
         scenario=describe(question.scenario),
         prior=question.has_prior,
-        estimators=_described(spec.estimators),
+        estimators=asked.estimators,
     )
     return own(question, spec.estimators, trials, spec.seed), folder
 
 
 def _of_log(asked: Single, files: list[str]) -> tuple[Own, AbstractContextManager[Path]]:
     from ipe_bench.questions.own.tracks import own_log
-    from ipe_bench.real.logs import LogQuestion
 
     spec = asked.spec
-    assert spec.state_model is not None
     trials = spec.trials or _LOGS
-    asked.words.refuse(
-        ("error_scale",), "is of simulated trials; give the state model another prior"
-    )
-    readings = files[0] if len(files) == 1 else tuple(files)
-    log = LogQuestion.of(spec.state_model, readings, spec.estimators, spec.ignored, ()).log
+    log = asked.log_question(files[0] if len(files) == 1 else tuple(files)).log
     folder = _folder(
         asked,
         trials,
         files,
         model=describe(log.model),
-        trackers=_described(spec.estimators),
+        trackers=asked.estimators,
     )
     return own_log(log, spec.estimators, trials, spec.seed), folder

@@ -15,23 +15,19 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.noise.base import Noise
 from ipe_bench.plugins import standard
 from ipe_bench.questions.own.maths import require_answer
+from ipe_bench.real.estimation import Question
 from ipe_bench.real.fits import Fit
 
 NEAR = 0.1
 """Error scale about an estimate, unless another is given."""
 
 
-def fitted(spec: Spec, files: Sequence[str], stated: Collection[str]) -> Fit:
-    """Fits the model of a job to the readings in files; `stated` are the keys that were typed.
-
-    Raises:
-        UserError: nothing can be simulated like these readings.
-    """
+def question_on(spec: Spec, files: Sequence[str], stated: Collection[str]) -> Question:
+    """Returns the question on the readings in files that `auto` answers; `stated` are the keys that
+    were typed."""
     estimators = standard.constructed({"solver": ("auto",)})
     asked = replace(spec, readings=tuple(files), estimators=estimators)
-    fits, _ = asked.question(stated).checked().fitted()
-    require_answer(fits[0])
-    return fits[0]
+    return asked.question(stated).checked()
 
 
 def noise_of(fit: Fit) -> Gaussian:
@@ -46,8 +42,14 @@ def like_these(
     spec: Spec, files: Sequence[str], stated: Collection[str], *, at_estimate: bool
 ) -> tuple[Spec, list[str]]:
     """Returns the job with the columns and noise of these readings, and lines that say what was
-    taken; with its truths about the estimate, or about the start."""
-    fit = fitted(spec, files, stated)
+    taken; with its truths about the estimate, or about the start.
+
+    Raises:
+        UserError: nothing can be simulated like these readings.
+    """
+    fits, _ = question_on(spec, files, stated).fitted()
+    fit = fits[0]
+    require_answer(fit)
     model = fit.given.model
     if isinstance(model, ConstrainedModel):
         # What is known of parameters is a key of the job, which goes on.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import words as w
@@ -16,6 +16,10 @@ from ipe_bench.cli.spec import Spec
 from ipe_bench.cli.words import Words
 from ipe_bench.measurements import Nist
 from ipe_bench.report.page.writer import reserved_folder
+from ipe_bench.runs.provenance import describe
+
+if TYPE_CHECKING:
+    from ipe_bench.real.logs import LogQuestion
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,24 @@ class Single:
         if isinstance(model, Nist):
             return f"nist/{model.dataset.lower()}"
         return self.words.chosen(group) or model.name
+
+    @property
+    def estimators(self) -> dict[str, Any]:
+        """Estimators or trackers of the request, described."""
+        return {label: describe(one) for label, one in self.spec.estimators.items()}
+
+    def log_question(
+        self, readings: str | Sequence[str] | None, find: str | Sequence[str] = ()
+    ) -> LogQuestion:
+        """Returns the question on the states of a log."""
+        from ipe_bench.real.logs import LogQuestion
+
+        spec = self.spec
+        assert spec.state_model is not None
+        self.words.refuse(
+            ("error_scale",), "is of simulated trials; give the state model another prior"
+        )
+        return LogQuestion.of(spec.state_model, readings, spec.estimators, spec.ignored, find)
 
     def folder(
         self, name: str, identity: Any, files: Sequence[str] = ()
