@@ -7,10 +7,10 @@ they do is recorded: they may use + - * / **, NumPy's sin cos tan arctan exp log
 tanh, arctan2 hypot sign floor mod, comparisons, np.where, np.minimum and np.maximum, loops of fixed
 length, and anything else that does not ask for a value (no if, no array of floats that is filled
 with results). A comparison is the number 0 or 1, as in a formula: + counts those that hold, where
-NumPy's would be their `or`. From the recording come machine code for whole batches and the exact Jacobian;
-nothing else is to be written. `cases` adds experiments that share the parameters and differ in
-constants c, `driven` constants that change with time, and `si_sizes` the sizes of parameters that
-are shown in other units.
+NumPy's would be their `or`. From the recording come machine code for whole batches and the exact
+Jacobian; nothing else is to be written. `cases` adds experiments that share the parameters and
+differ in constants c, `driven` constants that change with time, and `si_sizes` the sizes of
+parameters that are shown in other units.
 
 The method is of eighth order. Each trial's step follows from its own parameters: it is halved until
 half the step shows that the readings hold `tolerance`, and the Jacobian uses the same. `step` fixes
