@@ -7,10 +7,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import cached_property
-from itertools import combinations, compress, pairwise
+from functools import cache, cached_property
+from itertools import combinations, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc, ndtri
@@ -86,11 +86,18 @@ _NEAR_ZERO = 7.0
 """What is subtracted from the logarithm of a deviation that stands for 0, where a model has no
 likelihood at 0."""
 _CERTAIN = 0.25
-"""A deviation whose logarithm has a smaller standard error is not tried at 0."""
+"""A deviation whose logarithm has a smaller standard error is not tried at 0, and has an interval
+by that error."""
 _EFFECT = 1e-3
 """A change of the log likelihood by more than this is an effect."""
-_VAGUE = 5.0
-"""Their standard errors where there is no maximum."""
+_ONE_SIDED = float(ndtri(0.95)) ** 2 / 2
+"""Log likelihood that is lost at the upper limit of a deviation that is held at 0: twice that is
+chi-square with a degree in half of all logs, else 0 (Self and Liang, J. American Statistical
+Association 82, 1987)."""
+_TWO_SIDED = float(ndtri(0.975)) ** 2 / 2
+"""The same at both ends of an interval, of a chi-square with a degree."""
+_VAGUE = 20.0
+"""Their standard errors where there is no maximum: at 0 a cost is larger by less than `_EFFECT`."""
 
 
 @dataclass(frozen=True)
@@ -264,6 +271,7 @@ class Constant:
     """The lower end of its 95 % interval, which for a standard deviation is symmetric in the
     logarithm."""
     high: float
+    """Its upper end; of a deviation that is held at 0 the one-sided upper limit."""
 
 
 @dataclass(frozen=True)
@@ -593,17 +601,17 @@ def found_and_tracked(
         message = (
             f"no maximum of the likelihood was found in {', '.join(find)}: the log may not"
             f" determine all of them; the search ended after {best.evaluations} evaluations at"
-            f" {sought.written(best.u)}, and the track uses the model's own values"
+            f" {sought.written(best)}, and the track uses the model's own values"
         )
         own = LogTracks.of(log, label, tracker)
         return replace(own, message=message, found=NO_MAXIMUM, passes=False)
     track = LogTracks.of(replace(log, model=sought.at(best.u)), label, tracker)
-    notes = [
-        f"the likelihood is largest at {name}=0, where it is held" for name in sought.at_zero(best)
-    ]
+    with np.errstate(invalid="ignore"), unchanged():
+        found_constants = sought.constants(best, cost, watch)
+    notes = [_at_zero_words(one) for one in found_constants if one.value == 0]
     notes += [
         f"another maximum, of a log likelihood {one.cost - best.cost:.3g} lower, is at"
-        f" {sought.written(one.u)}"
+        f" {sought.written(one)}"
         for one in others
         if one.is_maximum
     ]
@@ -615,17 +623,28 @@ def found_and_tracked(
             f" {track.fit_p:.2g}; white: p = {track.white_p:.2g}): the model does not describe the"
             " log, and neither values nor errors can be trusted"
         )
-    elif any(one.is_maximum and one.cost - best.cost < _ALIKE for one in others):
+    elif any(
+        one.is_maximum and one.cost - best.cost < _ALIKE and sought.is_beyond(found_constants, one)
+        for one in others
+    ):
         found = SEVERAL_MAXIMA
         message = "several maxima fit the log almost equally well"
     return replace(
         track,
-        constants=sought.constants(best),
+        constants=found_constants,
         notes=[*track.notes, *notes],
         found=found,
         message=message,
         passes=track.passes and not found,
     )
+
+
+def _at_zero_words(one: Constant) -> str:
+    """Says that a deviation is held at 0, and how large it may be."""
+    held = f"the likelihood is largest at {one.name}=0, where it is held"
+    if np.isinf(one.high):
+        return f"{held}; the log sets it no upper limit"
+    return f"{held}; 95 % upper limit {one.high:.3g} (one-sided)"
 
 
 @dataclass(frozen=True)
@@ -667,9 +686,9 @@ class _Sought:
         scaled = self.start * np.exp(logarithms)
         return np.where(self.positive, scaled, self.start + self.size * u)
 
-    def written(self, u: Array) -> str:
-        """Words the numbers at u."""
-        values = zip(self.names, self.values(u), strict=True)
+    def written(self, end: _Minimum) -> str:
+        """Words the numbers at the end of a search."""
+        values = zip(self.names, np.where(end.zero, 0.0, self.values(end.u)), strict=True)
         return ", ".join(f"{name}={value:.4g}" for name, value in values)
 
     def at(self, u: Array) -> StateModel:
@@ -688,17 +707,25 @@ class _Sought:
             parts[key] = value
         return parts
 
-    def at_zero(self, best: _Minimum) -> list[str]:
-        """Names the numbers that are held at 0."""
-        return list(compress(self.names, best.zero))
+    def is_beyond(self, constants: Sequence[Constant], end: _Minimum) -> bool:
+        """Tells whether the end of a search lies outside the intervals of constants."""
+        values = np.where(end.zero, 0.0, self.values(end.u))
+        pairs = zip(constants, values, strict=True)
+        return any(not one.low <= value <= one.high for one, value in pairs)
 
-    def constants(self, best: _Minimum) -> list[Constant]:
-        """Returns the numbers at a minimum, with intervals that are normal in u."""
+    def constants(
+        self, best: _Minimum, cost: Callable[[Array], float], watch: Callable[[str], object]
+    ) -> list[Constant]:
+        """Returns the numbers at a minimum of a cost, with intervals that are normal in u, or those
+        of the profile where a deviation is uncertain or held at 0."""
         values = np.where(best.zero, 0.0, self.values(best.u))
         errors = np.where(self.positive, values, self.size) * best.error
         reach = float(ndtri(0.975)) * best.error
-        low = self.values(best.u - reach)
-        high = self.values(best.u + reach)
+        ends = np.stack([best.u - reach, best.u + reach])
+        for i in np.flatnonzero(best.zero | self.positive & (best.error > _CERTAIN)):
+            search = _Search(cost, f"interval of {self.names[int(i)]}", watch)
+            ends[:, i] = _Profile(search, best, int(i), self.positive).limits()
+        low, high = map(self.values, ends)
         rows = np.column_stack([values, errors, low, high]).tolist()
         return [Constant(name, *row) for name, row in zip(self.names, rows, strict=True)]
 
@@ -878,14 +905,64 @@ def _at_zero(search: _Search, u: Array, i: int) -> float | None:
     return None
 
 
-def _polished(search: _Search, u: Array, positive: Mask, zero: Mask) -> _Minimum:
-    """Finds the end of Newton's iteration from u by those that are not `zero`, which stops where a
-    logarithm has hardly any effect on the cost."""
-    free = np.flatnonzero(~zero)
+class _Profile:
+    """The cost, least by the others, as a function of one number's coordinate, less its minimum."""
+
+    def __init__(self, search: _Search, best: _Minimum, i: int, positive: Mask) -> None:
+        self.search = search
+        self.best = best
+        self.i = i
+        self.positive = positive
+        self.held = best.zero.copy()
+        self.held[i] = True
+        self.u = best.u
+        """Where the others were least."""
+
+    def __call__(self, value: float) -> float:
+        u = self.u.copy()
+        u[self.i] = value
+        self.search.evaluations = 0
+        end = _polished(self.search, u, self.positive, self.held)
+        if end.is_maximum:
+            self.u = end.u
+        return min(end.cost - self.best.cost, _FAR)
+
+    def limits(self) -> tuple[float, float]:
+        """Finds between which coordinates of a positive number the profile is below the limit of 95
+        %: from minus infinity on if it is so at 0."""
+        if self.best.zero[self.i]:
+            start = 0.0
+            while self(start) > _ONE_SIDED:
+                start -= 1.0
+            return -np.inf, self._end(start, 1.0, _FAR, _ONE_SIDED)
+        start = float(self.best.u[self.i])
+        ends = ((-1.0, _NEAR_ZERO), (1.0, _FAR))
+        low, high = (self._end(start, step, most, _TWO_SIDED) for step, most in ends)
+        return low, high
+
+    def _end(self, start: float, step: float, most: float, limit: float) -> float:
+        """Finds where the profile passes a limit, in steps from a start below it; infinite if it
+        does not within so much."""
+        from scipy.optimize import brentq
+
+        known = cache(self)
+        inside = start
+        known(inside)
+        while known(inside + step) < limit:
+            inside += step
+            if abs(inside - start) >= most:
+                return float(np.copysign(np.inf, step))
+        ends = sorted((inside, inside + step))
+        return float(brentq(lambda value: known(value) - limit, *ends, xtol=1e-3))  # type: ignore[arg-type]
+
+
+def _polished(search: _Search, u: Array, positive: Mask, held: Mask) -> _Minimum:
+    """Finds the end of Newton's iteration from u by those that are not `held`."""
+    free = np.flatnonzero(~held)
     n = len(free)
     error = np.full(len(u), np.nan)
     if not n:
-        return _Minimum(u, search(u), error, np.zeros((0, 0)), search.evaluations, zero)
+        return _Minimum(u, search(u), error, np.zeros((0, 0)), search.evaluations, held)
 
     def cost(values: Array) -> float:
         return search(placed(values))
@@ -895,9 +972,27 @@ def _polished(search: _Search, u: Array, positive: Mask, zero: Mask) -> _Minimum
         whole[free] = values
         return whole
 
-    v = u[free]
-    if zero.any():
-        v, _ = _descended(cost, v)
+    end = _by_newton(search, cost, u[free], positive[free])
+    if end.deviation is None and held.any():
+        v, _ = _descended(cost, end.v)
+        end = _by_newton(search, cost, v, positive[free])
+    error[free] = np.nan if end.deviation is None else end.deviation
+    return _Minimum(placed(end.v), end.cost, error, end.H, search.evaluations, held)
+
+
+class _End(NamedTuple):
+    """Holds where Newton's iteration ended."""
+
+    v: Array
+    cost: float
+    deviation: Array | None
+    """None if there is no minimum."""
+    H: Array
+
+
+def _by_newton(search: _Search, cost: Callable[[Array], float], v: Array, positive: Mask) -> _End:
+    """Iterates until a step is small, or a logarithm has hardly any effect on the cost."""
+    n = len(v)
     h = np.full(n, 1e-2)
     rounds = search.left // (n**2 + n + 1)
     for _ in range(min(_ROUNDS, rounds)):
@@ -909,15 +1004,13 @@ def _polished(search: _Search, u: Array, positive: Mask, zero: Mask) -> _Minimum
         # its maximum.
         P = np.linalg.inv(H)
         deviation = deviations(P)
-        if (deviation[positive[free]] >= _VAGUE).any():
+        if (deviation[positive] >= _VAGUE).any():
             break
         v = v - P @ g
         h = _STEP * deviation
         if g @ P @ g < _DONE:
-            error[free] = deviation
-            return _Minimum(placed(v), here, error, H, search.evaluations, zero)
-    nothing = np.full((n, n), np.nan)
-    return _Minimum(placed(v), cost(v), error, nothing, search.evaluations, zero)
+            return _End(v, here, deviation, H)
+    return _End(v, cost(v), None, np.full((n, n), np.nan))
 
 
 def _derivatives(cost: Callable[[Array], float], u: Array, h: Array) -> tuple[float, Array, Array]:

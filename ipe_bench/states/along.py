@@ -259,11 +259,26 @@ def renumbered(functions: EpochFunctions, model: StateModel, name: str) -> Epoch
             at, there = numbers[one.form]
             if not np.array_equal(at, one.epochs):
                 return None
-            own = [_of_model(each, function) for each in one.own]
-            recordings.append(one._replace(numbers=there, own=own))
+            recordings.append(one._replace(numbers=there, own=_OfModel(one.own, function)))
         else:
             recordings.append(one._replace(function=_of_model(one.function, function)))
     return replace(functions, recordings=recordings)
+
+
+class _OfModel(Sequence[Judged]):
+    """Functions of epochs with another model's in their places, each made where it is asked for."""
+
+    def __init__(self, own: Sequence[Judged], function: Function) -> None:
+        self.own = own
+        self.function = function
+
+    def __len__(self) -> int:
+        return len(self.own)
+
+    def __getitem__(self, i: Any) -> Any:
+        if isinstance(i, slice):
+            return _OfModel(self.own[i], self.function)
+        return _of_model(self.own[i], self.function)
 
 
 def _of_model(own: Judged, function: Function) -> Judged:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar, rosen
+from scipy.optimize import brentq, minimize, minimize_scalar, rosen
 from scipy.stats import multivariate_normal, norm
 from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity
@@ -182,13 +182,91 @@ def test_a_search_that_is_interrupted_is_one_line_and_no_file(
     assert not (tmp_path / "out").exists()
 
 
+def level_cost(w, s, z, spread):
+    """Minus the log likelihood of a local level, by its textbook recursion."""
+    x = 0.0
+    P = spread**2
+    total = 0.0
+    for reading in z:
+        P += w**2
+        S = P + s**2
+        e = reading - x
+        total += 0.5 * (np.log(2 * np.pi * S) + e**2 / S)
+        x += P / S * e
+        P *= 1 - P / S
+    return total
+
+
+def least_level_cost(z, spread, starts):
+    """The least of it, inside and on both bounds."""
+
+    def inside(u):
+        return level_cost(*np.exp(u), z, spread)
+
+    options = {"method": "bounded", "bounds": (-6, 4), "options": {"xatol": 1e-6}}
+    at_bounds = [
+        minimize_scalar(lambda v: level_cost(0.0, np.exp(v), z, spread), **options).fun,
+        minimize_scalar(lambda v: level_cost(np.exp(v), 1e-9, z, spread), **options).fun,
+    ]
+    return min(*at_bounds, *(minimize(inside, u, method="Nelder-Mead").fun for u in starts))
+
+
+@pytest.mark.oracle("closed form: the recursion of a local level", "log likelihood", 1e-3)
+@pytest.mark.parametrize(
+    "logs",
+    [4, pytest.param(30, marks=pytest.mark.slow), pytest.param(400, marks=pytest.mark.campaign)],
+)
+def test_every_simulated_local_level_has_an_answer_of_largest_likelihood(logs, monkeypatch):
+    """Levels that hardly move up to such that readings hardly blur; the largest likelihood is that
+    of the own search to 1e-3, and intervals hold the truth."""
+    if logs < 100:
+        monkeypatch.setattr(tracks, "SEARCHES", 1)
+    model = replace(LEVEL, count=40, spread={"level": 100.0}, noise={"w": 1.0})
+    model = replace(model, deviation={"flow": 1.0})
+    g = np.random.default_rng(1)
+    held = np.zeros((logs, 2), dtype=bool)
+    zeros = np.zeros((logs, 2), dtype=bool)
+    for i in range(logs):
+        w = (0.05, 0.2, 0.6, 3.0)[i % 4]
+        z = np.cumsum(w * g.standard_normal(40)) + g.standard_normal(40) + 3 * g.standard_normal()
+        (one,) = ib.estimate(model, z[:, None], {"kf": ekf()}, find=BOTH)
+        found = one.constants
+        assert found, one.message
+        values = np.array([each.value for each in found])
+        zeros[i] = values == 0
+        held[i] = [
+            each.low <= true <= each.high for each, true in zip(found, (w, 1.0), strict=True)
+        ]
+        own = level_cost(*np.maximum(values, [0.0, 1e-9]), z, 100.0)
+        assert_agrees(one.log_likelihood, -own, atol=1e-3)
+        starts = [(0.0, 0.0), (-3.0, 0.0), (0.0, -2.0)] if logs > 100 else [(np.log(w), 0.0)]
+        assert own < least_level_cost(z, 100.0, starts) + 1e-3
+    if logs < 10:
+        return
+    # A level that moves by 0.05 is mostly found not to move at all.
+    assert 0.1 < zeros[:, 0].mean() < 0.3
+    assert (np.abs(held.mean(axis=0) - 0.95) < 4 * np.sqrt(0.95 * 0.05 / logs)).all()
+
+
 @pytest.mark.slow
 def test_a_log_without_noise_has_none():
     x = 0.8 ** np.arange(1, 61)
     (one,) = ib.estimate(DAMPED, x[:, None], {"kf": ekf()}, find="w")
     assert one.passes
-    assert [each.value for each in one.constants] == [0.0]
-    assert one.notes == ["the likelihood is largest at w=0, where it is held"]
+    (w,) = one.constants
+    assert w.value == 0.0
+    assert w.high == pytest.approx(
+        brentq(
+            lambda u: (
+                dense_log_likelihood(0.8, 0.0, 1.0, x)
+                - dense_log_likelihood(0.8, u, 1.0, x)
+                - norm.ppf(0.95) ** 2 / 2
+            ),
+            0.01,
+            2.0,
+        ),
+        rel=2e-3,
+    )
 
 
 @pytest.mark.slow
@@ -210,7 +288,34 @@ def test_a_variance_whose_likelihood_is_largest_at_zero_is_zero():
     assert (w.value, one.found) == (0.0, "")
     assert flow.value == pytest.approx(1.0, abs=1e-4)
     assert flow.error == pytest.approx(1 / np.sqrt(24), rel=1e-3)
-    assert one.notes == ["the likelihood is largest at w=0, where it is held"]
+    k = np.arange(1, 13)
+
+    def profile(level):
+        def cost(noise):
+            C = level**2 * np.minimum.outer(k, k) + noise**2 * np.eye(12)
+            return -multivariate_normal(np.zeros(12), C).logpdf(z[:, 0])
+
+        return minimize_scalar(cost, bounds=(0.1, 5.0), method="bounded").fun
+
+    limit = brentq(lambda level: profile(level) - profile(0.0) - 2.7055434541 / 2, 0.001, 5.0)
+    assert (w.low, w.high) == (0.0, pytest.approx(limit, rel=2e-3))
+    (note,) = one.notes
+    assert note.endswith(f"w=0, where it is held; 95 % upper limit {limit:.3g} (one-sided)")
+
+
+@pytest.mark.slow
+def test_an_uncertain_deviation_has_the_interval_of_its_profile():
+    """Its ends cost 1.92 of the dense log likelihood, or it begins at 0."""
+    z = DAMPED.draw(0, 1, 2).z[0, :12]
+    (one,) = ib.estimate(replace(DAMPED, count=12), z, {"kf": ekf()}, find=["w"])
+    (w,) = one.constants
+
+    def lost(value):
+        return one.log_likelihood - dense_log_likelihood(0.8, value, 1.0, z[:, 0])
+
+    assert w.error / w.value > 0.25
+    for end in (w.low, w.high):
+        assert end == 0 or lost(end) == pytest.approx(norm.ppf(0.975) ** 2 / 2, abs=5e-3)
 
 
 @pytest.mark.slow

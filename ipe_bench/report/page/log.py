@@ -55,7 +55,9 @@ _OF_PARTICLES = (
 )
 _OF_CONSTANTS = (
     f"Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
-    " the innovations, so only whiteness tests the model."
+    " the innovations, so only whiteness tests the model. Intervals of uncertain deviations are"
+    " those of the profile of the likelihood; of one that is held at 0, up to where it is 1.35"
+    " lower (95 %, one-sided)."
 )
 _STORED = (
     *("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict"),
