@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -210,27 +210,25 @@ def _sums(s: Sample, cells: Sequence[StoredCell], epochs: int, columns: int) -> 
     return found
 
 
+def _error_statistic(name: str, title: str, told: str, q: float) -> Statistic:
+    whose = "all trials of trackers"
+    formula = partial(error_quantile, q=q)
+    where = ("tracks",)
+    return Statistic(
+        f"path_error_{name}", title, whose, told, formula, kind="physical", where=where
+    )
+
+
 STATISTICS: tuple[Statistic, ...] = (
-    Statistic(
-        "path_error_median",
+    _error_statistic(
+        "median",
         "median error, all epochs",
-        "all trials of trackers",
         "Median of a trial's root mean square error over all epochs. Of all states together, over"
         " the filter that is linearised at the true path, for smoothers too, so that all trackers"
         " are compared. A track that is not finite counts as infinite.",
-        lambda s: error_quantile(s, 0.5),
-        kind="physical",
-        where=("tracks",),
+        0.5,
     ),
-    Statistic(
-        "path_error_q95",
-        "95 % error, all epochs",
-        "all trials of trackers",
-        "95 % quantile of these errors.",
-        lambda s: error_quantile(s, 0.95),
-        kind="physical",
-        where=("tracks",),
-    ),
+    _error_statistic("q95", "95 % error, all epochs", "95 % quantile of these errors.", 0.95),
     Statistic(
         "path_rmse_solved",
         "rmse, solved",

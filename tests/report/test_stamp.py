@@ -6,7 +6,10 @@ import re
 from pathlib import Path
 
 import pytest
+from shared.reports import fill
+from shared.synthetic_store import Synthetic
 
+from ipe_bench.api import report
 from ipe_bench.cli.main import main
 from ipe_bench.report import figures
 
@@ -27,6 +30,26 @@ def written(folder: Path) -> dict[str, int]:
         str(path.relative_to(folder)): path.stat().st_mtime_ns
         for path in (*files, *folder.glob("runs/*"))
     }
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_tables_of_earlier_results_do_not_stay_and_files_of_others_do(
+    tmp_path: Path, stamped: bool
+) -> None:
+    store = Synthetic(tmp_path / "store")
+    fill(store, scales=(1.0,))
+    report([store.directory], store.directory, figures="none", formats="tex")
+    tables = store.directory / "tables"
+    (tables / "mine.tex").write_text("of somebody else")
+    (tables / "iterations.csv").write_text("of an estimator that is gone")
+    if not stamped:
+        (store.directory / ".report.json").unlink()
+    report([store.directory], store.directory, figures="none")
+    left = {path.name for path in tables.iterdir()}
+    assert "mine.tex" in left
+    assert {name for name in left if name.endswith(".tex")} == {"mine.tex"}
+    # A table that no stamp names is somebody else's, unless there is none and the name is ours.
+    assert ("iterations.csv" in left) == stamped
 
 
 @pytest.mark.slow

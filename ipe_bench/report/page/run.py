@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.files import regular, write_json, write_text
 from ipe_bench.plugins.extensions import files_of_records, use_statistics
-from ipe_bench.report.formats import FIGURES, PAGE
+from ipe_bench.report.formats import FIGURES, PAGE, TABLES
 from ipe_bench.report.style import Which, file_formats, which_figures
 from ipe_bench.report.tables.table import Part, Shown, Strong, Table, csv_text
 from ipe_bench.runs.store import Store
@@ -118,14 +118,25 @@ class Pending:
             stale=tuple(analysis.collection.stale),
             headline=tuple(opening),
         )
-        earlier = map(Path, _stamped(output).get("files", ()))
-        names = {path.name for path in earlier if path.parent.name == "tables"}
-        for name in names - {path.name for path in files}:
+        for name in _earlier_tables(output) - {path.name for path in files}:
             (output / "tables" / name).unlink(missing_ok=True)
-        if len(problems) == known:  # what plugins cannot make is said each time
-            stamp = {"from": self.made, "files": _digests(result.files)}
-            write_json(output / STAMP, stamp)
+        # What plugins cannot make is said each time: such a report is made from nothing known.
+        made = self.made if len(problems) == known else ""
+        write_json(output / STAMP, {"from": made, "files": _digests(result.files)})
         return result
+
+
+def _earlier_tables(output: Path) -> set[str]:
+    """Names the files of tables that an earlier report wrote, or may have written where no stamp
+    says which."""
+    from ipe_bench.report.sections import CURVES
+    from ipe_bench.report.tables.reports import NAMES
+
+    known = _stamped(output)
+    if "files" in known:
+        files = map(Path, known["files"])
+        return {path.name for path in files if path.parent.name == "tables"}
+    return {f"{name}.{kind}" for name in (*NAMES, *CURVES) for kind in TABLES}
 
 
 def _write_summaries(summary: pd.DataFrame, output: Path) -> list[Path]:

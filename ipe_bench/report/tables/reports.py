@@ -99,6 +99,9 @@ _OF_PARAMETERS = ("tracks", "parameters", "theory")
 """Names of the recorded tables that have a row per parameter."""
 _MAIN = ("overview", "tracks", "costs", "comparisons", "parameters", "calibration", "endings")
 _APPENDIX = ("all_trials", "solved_trials", "contraction", "covariances", "theory", "iterations")
+_CERTIFIED = ("certified", "certified_averages", "published")
+NAMES = (*_MAIN, *_APPENDIX, *_CERTIFIED)
+"""The tables that a report may have, plugins aside."""
 
 
 def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
