@@ -35,7 +35,7 @@ from ipe_bench.statistics.comparisons import ALPHA, differences, holm
 from ipe_bench.statistics.intervals import verdict
 from ipe_bench.statistics.sample import Sample, samples
 from ipe_bench.statistics.verdicts import CONSISTENT, NOT_REFUTED
-from ipe_bench.trials.thresholds import gate
+from ipe_bench.trials.thresholds import FEW, gate
 
 if TYPE_CHECKING:
     from ipe_bench.runs.results import StoredCell
@@ -216,24 +216,33 @@ def _columns(
 
 
 def _successes(a: Sample, b: Sample, one: Array, other: Array) -> tuple[Array, Array]:
-    """Returns the successes of both as the table of a run counts them; by the Cramér-Rao bound, one
-    gate for both, if one alone is held against the Bayesian bound."""
-    if a.group.footer["bound"] == b.group.footer["bound"]:
-        return a.scalars["success"][one], b.scalars["success"][other]
-    return a.inside_gate[one], b.inside_gate[other]
+    """Returns the successes of both by the one bound for both, as the table of a run counts them if
+    that is the bound of each."""
+    if _bound(a, b) == "crlb":
+        return a.inside_gate[one], b.inside_gate[other]
+    return a.scalars["success"][one], b.scalars["success"][other]
+
+
+def _bound(a: Sample, b: Sample) -> str:
+    """Names the bound that both are held against: the Cramér-Rao bound, unless both are held
+    against the Bayesian one."""
+    bounds = {a.group.footer["bound"], b.group.footer["bound"]}
+    return "bayes" if bounds == {"bayes"} else "crlb"
 
 
 def _honesty(a: Sample, b: Sample, one: Array, other: Array, most: float) -> _Column:
     """Returns the NEES by the number of parameters, at most that of an error on the gate.
 
-    Trials that do not converge claim nothing. What the second claims no more, in some or in all, is
-    on the gate.
+    Trials that do not converge claim nothing: those of both count. If they are fewer than a verdict
+    takes, but for trials that the first lacks too, the second claims no more: it is on the gate in
+    all trials that the first claims and it does not.
     """
     first = _claims(a, one)
     second = _claims(b, other)
     claimed = ~np.isnan(first)
     common = claimed & b.converged[other]
-    kept = common if common.any() else claimed
+    enough = common.sum() >= min(FEW, claimed.sum())
+    kept = common if enough and common.any() else claimed
     # The lesser of NaN, where nothing is claimed, and the most is the most.
     return _Column("honesty", np.fmin(first[kept], most), np.fmin(second[kept], most), most)
 
@@ -246,8 +255,8 @@ def _claims(sample: Sample, at: Array) -> Array:
 
 def _biases(a: Sample, b: Sample, one: Array, other: Array, largest: float) -> Iterator[_Column]:
     """Yields the errors of each parameter, in deviations of the bound, where both succeed."""
-    bound = a.group.footer["bound"]
-    both = a.inside_gate[one] & b.inside_gate[other]
+    bound = _bound(a, b)
+    both = np.logical_and(*_successes(a, b, one, other))
     errors_a = (a.error[one] / a.of_truth(bound)[one])[both]
     errors_b = (b.error[other] / b.of_truth(bound)[other])[both]
     for name, first, second in zip(a.names, errors_a.T, errors_b.T, strict=True):

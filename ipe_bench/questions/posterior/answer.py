@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 ADEQUATE = 0.1
 """Nats up to which a Gaussian may stand for another: a deviation is 40 % too large, or a mean 0.45
 deviations off."""
+CHANCE = 0.25
+"""Part of the noise that even the right Gaussian diverges by, on average: the noise is of the
+moments of two populations, each of half of the draws."""
 SAME_LAW = 0.05
 """Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some
 tenths of a nat."""
@@ -90,8 +93,9 @@ def _notes(found: Sequence[Reference]) -> Iterator[str]:
         " is chance. shift: difference of the means, in standard deviations of the posterior per"
         " root of the number of parameters. width: geometric mean of the ratios of standard"
         " deviations. energy: distance between draws. adequate: whether the Gaussian may stand for"
-        f" the posterior; that has a single mode then, the divergence is at most {ADEQUATE:g} or"
-        f" twice the noise, and the energy at most {SAME_LAW:g}."
+        f" the posterior; that has a single mode then, the divergence less {CHANCE:g} of the noise,"
+        f" which the right Gaussian has by chance, is at most {ADEQUATE:g}, and the energy at most"
+        f" {SAME_LAW:g}. ?: chance alone is more than {ADEQUATE:g}; take more particles."
     )
     for one in found:
         if not one.posterior.settled:
@@ -112,7 +116,10 @@ def adequate_word(d: Divergence, sampled: Posterior) -> str:
         return "-"
     if len(sampled.modes) != 1:
         return "NO"
-    near = d.kl <= max(ADEQUATE, 2 * sampled.noise) and d.energy <= SAME_LAW
+    chance = CHANCE * sampled.noise
+    near = d.kl - chance <= ADEQUATE and d.energy <= SAME_LAW
+    if near and chance > ADEQUATE:
+        return "?"
     return "yes" if near else "NO"
 
 

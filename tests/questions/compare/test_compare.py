@@ -16,7 +16,7 @@ import ipe_bench as ib
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery
 from ipe_bench.questions.compare.answer import finding
-from ipe_bench.trials.thresholds import GATE
+from ipe_bench.trials.thresholds import FEW, GATE
 
 ERROR = 0.1
 """The bound's deviation in the synthetic stores."""
@@ -297,6 +297,29 @@ def test_honesty_and_bias_are_those_of_the_definition(tmp_path):
     assert rows.loc["bias of b", "first_value"] == pytest.approx(e[:, 1].mean())
     assert rows.loc["bias of b", "change"] == pytest.approx(0.2)
     assert rows.loc["bias of a", ["change", "p"]].tolist() == [0.0, 1.0]
+
+
+def test_a_bias_is_of_the_trials_that_succeed_by_the_bound_that_divides_it(tmp_path):
+    """A tenth errs by two deviations more, within the Cramér-Rao gate and outside the Bayesian
+    one: an error without an estimator's success is no bias of it."""
+    fails = np.arange(1000) < 100
+    second = {"error": lambda e: e + 2.0 * np.outer(fails, [0.0, 1.0, 0.0]), "success": ~fails}
+    for knows, bias in ((True, 0.0), (False, 0.2)):
+        both = {"estimator": Pretender(knows_prior=knows)}
+        rows = changed(tmp_path / str(knows), both, both | second, fail_on=("bias",))
+        assert rows.loc["bias of b", "change"] == pytest.approx(bias)
+        assert rows.loc["bias of b", "trials"] == (900 if knows else 1000)
+
+
+@pytest.mark.parametrize(("claims", "judged"), [(FEW, FEW), (FEW - 1, 1000), (0, 1000)])
+def test_honesty_is_of_common_claims_or_lost_where_a_verdict_is_left_without_any(
+    tmp_path, claims, judged
+):
+    status = np.where(np.arange(1000) < claims, "converged", "diverged").astype(object)
+    row = changed(tmp_path, {}, {"status": status}, fail_on=("honesty",)).loc["honesty"]
+    assert row["trials"] == judged
+    assert row["finding"] == ("" if claims == FEW else "worse")
+    assert (row["second_value"] > 5) == (claims < FEW)
 
 
 def test_what_no_common_trial_shows_is_a_dash(tmp_path, capsys):

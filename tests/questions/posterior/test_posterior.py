@@ -15,10 +15,17 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.questions.posterior.answer import adequate_word, finding, sampled, write_posteriors
+from ipe_bench.questions.posterior.answer import (
+    CHANCE,
+    adequate_word,
+    finding,
+    sampled,
+    write_posteriors,
+)
 from ipe_bench.questions.posterior.maths import (
     Divergence,
     Posterior,
+    _kl,
     divergence,
     reference,
     sample_posterior,
@@ -105,6 +112,33 @@ def test_the_exact_gaussian_does_not_diverge_and_a_wrong_one_does_as_computed(li
     )
     assert finding([one]) == agreeing.format(1, "1 trial")
     assert finding([one, one]) == agreeing.format(2, "2 trials")
+
+
+@pytest.mark.parametrize(("n", "draws"), [(1, 400), (3, 400), (6, 400)])
+def test_a_quarter_of_the_noise_is_the_chance_in_the_divergence_of_the_right_gaussian(n, draws):
+    rng = np.random.default_rng(n)
+    noises, chances = [], []
+    for _ in range(100):
+        parts = rng.standard_normal((2, draws, n))
+        (first, S), (second, P), (both, whole) = (
+            (x.mean(axis=0), np.atleast_2d(np.cov(x.T))) for x in (*parts, parts.reshape(-1, n))
+        )
+        noises.append(_kl(second - first, P, S))
+        chances.append(_kl(both, np.eye(n), whole))
+    assert np.mean(chances) / np.mean(noises) == pytest.approx(CHANCE, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("kl", "noise", "word"),
+    [
+        *((0.09, 0.01, "yes"), (0.12, 0.01, "NO"), (0.12, 0.16, "yes"), (0.3, 0.16, "NO")),
+        *((0.19, 0.5, "?"), (1.0, 0.5, "NO"), (np.inf, 0.01, "-")),
+    ],
+)
+def test_what_is_adequate_allows_for_chance_and_not_for_more(kl, noise, word):
+    sampled_ones: Any = SimpleNamespace(modes=[0], noise=noise)
+    one: Any = SimpleNamespace(kl=kl, energy=0.0)
+    assert adequate_word(one, sampled_ones) == word
 
 
 def test_a_page_says_nothing_of_posteriors_whose_populations_differ(tmp_path):
