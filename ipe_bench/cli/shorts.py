@@ -77,6 +77,7 @@ def read(command: str, words: Sequence[str]) -> Short:
     ]
     files = [word for word, kind in zip(words, kinds, strict=True) if kind == "readings"]
     models = [word for word, kind in zip(words, kinds, strict=True) if kind == "model"]
+    _refuse_columns(words, [*files, *(file for word in words for file in _typed_files(word))])
     if not files and not models:
         return Short(list(words))
     files += [file for word in words for file in _typed_files(word)]
@@ -90,6 +91,14 @@ def read(command: str, words: Sequence[str]) -> Short:
     if not models:
         return Short(others, files)
     return _Reader(command, files, others).read(models[0])
+
+
+def _refuse_columns(words: Sequence[str], files: Sequence[str]) -> None:
+    """Refuses columns that are typed where a file has them: they would have no effect."""
+    typed = [word for word in words if word.lstrip("+").startswith("measurement.columns")]
+    if typed and files:
+        key = typed[0].partition("=")[0]
+        raise UserError(f"{key}: {files[0]} has the columns; remove the key, or the file")
 
 
 def _kind(word: str) -> str:

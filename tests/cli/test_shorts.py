@@ -106,6 +106,8 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
     ("words", "said"),
     [
         (["falling.py"], "is a model without readings; add their file"),
+        (["a*t+b", "line.csv", "measurement.columns.t=[1,2]"], "columns.t: line.csv has the col"),
+        (["readings=line.csv", "measurement.columns={t: [1]}"], "columns: line.csv has the col"),
         (["falling.csv"], "no model is given"),
         (["faling.py", "falling.csv"], "faling.py: there is no such file here; did you mean"),
         (["falling.py", "faling.csv"], "faling.csv: there is no such file here; did you mean"),
