@@ -14,6 +14,15 @@ from ipe_bench.plugins.construct import construct, described
 from ipe_bench.report.tables.table import Table, words
 from ipe_bench.states.base import StateModel
 
+_START = (
+    "measurement/function",
+    "solver/auto",
+    "baseline/levenberg_marquardt",
+    "baseline/iterated_ekf",
+    "tracker/auto",
+)
+"""What a newcomer needs of all groups: a model, estimators of three kinds, and a tracker."""
+
 
 def list_command(names: Sequence[str], verbose: bool) -> int:
     """Prints one line per option of each group, with its own options if `verbose`; for GROUP/NAME
@@ -21,6 +30,10 @@ def list_command(names: Sequence[str], verbose: bool) -> int:
     print_problems(plugins.take_problems())
     groups = plugins.groups()
     known = {*groups, "statistic", "figure"}
+    if not names:
+        every = {f"{one.group}/{one.name}": one.summary for one in plugins.options()}
+        _show("start here", {"option": _START, "what it is": [every[name] for name in _START]})
+        print()
     for name in names or groups:
         group, slash, option = name.partition("/")
         if group not in known:

@@ -1,5 +1,4 @@
-"""One tracker for those who do not want to choose: it goes further only where the readings say that
-it has to."""
+"""The default tracker: it goes further only where the readings say that it has to."""
 
 from __future__ import annotations
 

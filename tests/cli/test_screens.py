@@ -147,6 +147,14 @@ def test_lists_name_every_option(screen):
         assert rows(lines, name) == 1
 
 
+def test_the_list_of_all_begins_with_five_to_start_with(screen):
+    lines = [line for line in screen("list") if line.strip()]
+    named = re.findall(r"^ (\w+/\w+) ", "\n".join(lines), re.MULTILINE)
+    assert lines[0].strip() == "start here"
+    assert len(named) == 5
+    assert {"measurement/function", "solver/auto", "tracker/auto"} <= set(named)
+
+
 @pytest.fixture(scope="module")
 def answer():
     model = ib.measurements.Polynomial()

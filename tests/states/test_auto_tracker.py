@@ -1,4 +1,4 @@
-"""The tracker for those who do not want to choose: which stage answers what."""
+"""The default tracker: which stage answers what."""
 
 from __future__ import annotations
 
