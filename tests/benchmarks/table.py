@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import peers
+from reach import outcome, scenarios
 from scale import TRIALS, WORKERS, Usage, measured, used
 from scipy.integrate import solve_ivp
 
@@ -385,9 +386,22 @@ def scale() -> Iterator[Row]:
     yield Row("scale", f"{what}: on disk", many.files, "files", tenth, few.files)
 
 
+def reach() -> Iterator[Row]:
+    """What `auto` reaches on problems that its constants were not chosen on."""
+    for name, problem in scenarios():
+        where = f"{name}, error scale {problem.error_scale:g}"
+        ours = outcome(problem, ib.solvers.Auto())
+        other = outcome(problem, ib.solvers.Progressive())
+        beside = "progressive"
+        yield Row("reach", f"{where}: solved", 100 * ours.solved, "%", beside, 100 * other.solved)
+        told = f"{where}: solved, or told"
+        yield Row("reach", told, 100 * ours.told, "%", beside, 100 * other.told)
+        yield Row("reach", f"{where}: cost", ours.cost, "sim.", beside, other.cost)
+
+
 PARTS = {
     f.__name__: f
-    for f in (simulation, jacobians, stiff, estimation, filters, trackers, paths, loop)
+    for f in (simulation, jacobians, stiff, estimation, reach, filters, trackers, paths, loop)
 }
 LONG = {"scale": scale}
 """Takes minutes: only where it is asked for."""
