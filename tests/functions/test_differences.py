@@ -2,7 +2,14 @@
 
 import numpy as np
 
-from ipe_bench.functions.differences import along_units, measured
+from ipe_bench.functions.differences import (
+    along_units,
+    by_steps,
+    measured,
+    steps_of_a_rough_function,
+    unmoved,
+)
+from ipe_bench.functions.judged import Judged, same_values
 
 
 def test_a_coordinate_blurs_the_slopes_along_itself_alone():
@@ -12,3 +19,42 @@ def test_a_coordinate_blurs_the_slopes_along_itself_alone():
     slope, error = measured(lambda x: np.sin(1e3 * x[:, 1:]), x, units).central
     assert np.abs(slope[0, 0] - [0.0, 0.1 * np.cos(1.0)]).max() < 1e-12
     assert error.max() < 1e-10
+
+
+def test_a_constant_has_the_slope_0_whatever_its_digits():
+    """Also 1.0, whose digits are those of a function in single precision."""
+    x = np.array([[0.3], [2.0]])
+    slope, error = measured(lambda x: np.ones((len(x), 1)), x, along_units(np.ones(1), 2)).central
+    assert (slope == 0.0).all()
+    assert error.max() < 1e-10
+
+
+def test_steps_of_a_rough_function_step_over_its_ripples():
+    """3 x, with ripples of 1e-6 that no slope should see."""
+    x = np.linspace(0.1, 1.0, 9)[:, None]
+
+    def rough(x):
+        return 3 * x + 1e-6 * np.sin(1e7 * x)
+
+    steps = steps_of_a_rough_function(rough, x, np.array([0.04]), unmoved)
+    assert steps is not None
+    assert steps.apart.max() < 0.1
+    assert np.abs(by_steps(rough, x, steps, unmoved) - 3.0).max() < 1e-3
+
+
+def test_an_output_that_stays_0_is_not_doubted():
+    called = []
+
+    def still(x):
+        called.append(len(x))
+        return 0 * x
+
+    _, J = Judged(still, np.ones(1)).slopes(np.linspace(0.0, 1.0, 5)[:, None])
+    assert (J == 0.0).all()
+    assert sum(called) <= 5 * 4
+
+
+def test_values_are_the_same_if_both_are_missing():
+    assert same_values(np.array([[np.nan, 1.0]]), np.array([[np.nan, 1.0 + 1e-16]]))
+    assert not same_values(np.array([[np.nan, 1.0]]), np.array([[2.0, 1.0]]))
+    assert not same_values(np.array([[2.0, 1.0]]), np.array([[np.nan, 1.0]]))

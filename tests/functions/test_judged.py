@@ -105,6 +105,8 @@ def _swallowed(x):
         (lambda x: np.logical_xor(x, 1.0) * x, "of numbers"),
         (lambda x: np.sqrt(x > 0) * x, "of truth values"),
         (lambda x: np.linalg.norm(x, 1, axis=-1, keepdims=True), "order 1"),
+        (lambda x: x.astype(int), "astype"),
+        (lambda x: np.nextafter(x, 0.0), "np.nextafter is not recorded"),
     ],
 )
 def test_what_would_be_recorded_as_another_function_is_refused(function, why):
@@ -122,6 +124,12 @@ TRUTHS = {
     "a limit": lambda a, b: np.clip(a, b, 1.0) + np.isinf(1 / a) * 3.0,
     "a mean": lambda a, b: np.mean([a, b, a * b], axis=0),
     "how many": lambda a, b: np.sum(np.stack([a > 0, b > 0, a > b]), axis=0) * b,
+    "a truth as a number": lambda a, b: (a > 0).astype(float) + (b > 0).astype(float),
+    "a length": lambda a, b: np.linalg.norm(np.stack([a, b], axis=-1), axis=-1),
+    "between places": lambda a, b: np.interp(a, [-1.5, 0.0, 2.0], [3.0, 1.0, 5.0]) * b,
+    "without NaN": lambda a, b: np.nan_to_num(a) + b,
+    "a product of truths": lambda a, b: (a > 0) * (b > 0) + np.minimum(a > 1, b > 1),
+    "whole numbers and truths": lambda a, b: (a + np.int64(2)) * np.True_ - b * True,
     "the larger of truths": lambda a, b: np.maximum(a > 0, b > 0) + (a > b),
 }
 
