@@ -2,6 +2,5 @@
 bench.
 
 Equations are functions of expressions, recorded once; a `Kernel` of them integrates many trials at
-a time. A `RowFunction` runs a recorded function on many rows of numbers; `solve_chains` solves the
-equations of whole paths.
+a time. A `RowFunction` runs a recorded function on many rows of numbers, and a `Step` along epochs.
 """

@@ -19,13 +19,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from llvmlite import ir
 
-from ipe_bench.engine.chains import ChainSize, Epoch
 from ipe_bench.engine.plan import StepPlan
 from ipe_bench.engine.scan import Step
 from ipe_bench.engine.trace import Program, RowPrograms
@@ -110,504 +108,82 @@ def rows(source: RowPrograms, width: int) -> str:
 
 def scan(step: Step, program: Program, width: int) -> str:
     """Writes what `engine.scan` describes; a lane is a trial."""
-    arguments = ir.FunctionType(VOID, [PTR] * 4 + [I64] * 5)
-    made: Any = ir.Function(ir.Module("scan"), arguments, "scan")
-    carry, each, shared, out, trials, first, by, count, length = made.args
+    kinds = [*[PTR] * 3, *[I64] * 5, *[PTR, I64, I64] * len(step.each)]
+    made: Any = ir.Function(ir.Module("scan"), ir.FunctionType(VOID, kinds), "scan")
+    carry, shared, out, trials, first, by, count, length, *each = made.args
     b: Any = ir.IRBuilder(made.append_basic_block())
     v = _Blocks(b, width)
     lanes = [ir.Constant(I32, i) for i in range(width)]
-    sizes = (step.carried, step.each, step.shown)
+    sizes = (step.carried, sum(step.each), step.shown)
     kept, given, shown = (room(b, v.type, max(size, 1), 8 * width) for size in sizes)
 
-    def row(array: Value, index: Value, size: int) -> Value:
-        return b.gep(array, [b.mul(index, integer(size))], source_etype=F64)
+    def row(array: Value, index: Value, size: Value) -> Value:
+        return b.gep(array, [b.mul(index, size)], source_etype=F64)
 
     def gather(rows: list[Value], frame: Value, size: int) -> None:
-        with loop(b, integer(0), integer(size)) as j:
+        def whole(j: Value) -> None:
+            squares = [v.load_at(begin, j) for begin in rows]
+            places = [b.add(j, integer(i)) for i in range(width)]
+            v.store(v.turned(squares), frame, places)
+
+        def one(j: Value) -> None:
             vector = ir.Constant(v.type, ir.Undefined)
             for lane, begin in zip(lanes, rows, strict=True):
                 vector = b.insert_element(vector, number_at(b, begin, j), lane)
-            v.store([vector], v.place(frame, j), [0])
+            v.store([vector], frame, [j])
+
+        in_squares(size, whole, one)
 
     def scatter(frame: Value, rows: list[Value], size: int) -> None:
-        with loop(b, integer(0), integer(size)) as j:
+        def whole(j: Value) -> None:
+            places = [b.add(j, integer(i)) for i in range(width)]
+            for begin, vector in zip(rows, v.turned(v.load(frame, places)), strict=True):
+                v.store_at(vector, begin, j)
+
+        def one(j: Value) -> None:
             (vector,) = v.load(frame, [j])
             for lane, begin in zip(lanes, rows, strict=True):
                 put(b, b.extract_element(vector, lane), begin, j)
+
+        in_squares(size, whole, one)
+
+    def in_squares(size: int, whole: Callable[[Value], None], one: Callable[[Value], None]) -> None:
+        """Copies `width` numbers of each lane at a time, the last of them with some again."""
+        if size < width:
+            with loop(b, integer(0), integer(size)) as j:
+                one(j)
+            return
+        with loop(b, integer(0), integer(size - size % width), width) as j:
+            whole(j)
+        if size % width:
+            whole(integer(size - width))
 
     with loop(b, integer(0), trials, width) as group:
         last = b.sub(trials, integer(1))
         own = [b.add(group, integer(i)) for i in range(width)]
         # A group that is not full repeats the last trial.
         own = [b.select(b.icmp_signed("<", one, last), one, last) for one in own]
-        begins = [row(carry, one, step.carried) for one in own]
+        begins = [row(carry, one, integer(step.carried)) for one in own]
         gather(begins, kept, step.carried)
         with loop(b, integer(0), count) as i:
             k = b.add(first, b.mul(by, i))
-            places = [b.add(b.mul(one, length), k) for one in own]
-            gather([row(each, place, step.stride) for place in places], given, step.each)
-            epoch = row(shared, k, step.shared)
+            place = 0
+            for j, size in enumerate(step.each):
+                array, its_length, stride = each[3 * j : 3 * j + 3]
+                rows = [row(array, b.add(b.mul(one, its_length), k), stride) for one in own]
+                gather(rows, v.place(given, place), size)
+                place += size
+            epoch = row(shared, k, integer(step.shared))
             numbers = [v.spread(number_at(b, epoch, integer(j))) for j in range(step.shared)]
-            inputs = [*v.load(kept, range(step.carried)), *v.load(given, range(step.each))]
+            inputs = [*v.load(kept, range(step.carried)), *v.load(given, range(sum(step.each)))]
             found = v.run(program, [*inputs, *numbers])
             v.store(found[: step.carried], kept, range(step.carried))
             v.store(found[step.carried :], shown, range(step.shown))
-            scatter(shown, [row(out, place, step.shown) for place in places], step.shown)
+            to = [row(out, b.add(b.mul(one, length), k), integer(step.shown)) for one in own]
+            scatter(shown, to, step.shown)
         scatter(kept, begins, step.carried)
     b.ret_void()
     return str(made.module)
-
-
-def chains(size: ChainSize, width: int) -> str:
-    """Writes void chains(double *A, double *B, double *D, double *G, double *a, double *v, double
-    *x, double *P, double *crossed, int64 trials, int64 epochs, double *frame), which
-    `engine.chains` describes; null is what is not asked for. A lane is a trial; a group that is not
-    full repeats its last one."""
-    return str(_ChainWriter(size, width).module)
-
-
-@dataclass(frozen=True)
-class _Lanes:
-    """Numbers in the frame, a vector for each, or a matrix of them in rows of n."""
-
-    v: _Vectors
-    begin: Value
-    n: int
-
-    def __getitem__(self, i: Value) -> Value:
-        return self.v.load(self.begin, [i])[0]
-
-    def __setitem__(self, i: Value, value: Value) -> None:
-        self.v.store([value], self.v.place(self.begin, i), [0])
-
-    def row(self, i: Value) -> _Lanes:
-        place = self.v.builder.mul(i, integer(self.n))
-        return _Lanes(self.v, self.v.place(self.begin, place), self.n)
-
-    def all(self) -> list[Value]:
-        return self.v.load(self.begin, range(self.n))
-
-    def column(self, j: Value) -> list[Value]:
-        return self.v.load(self.v.place(self.begin, j), range(0, self.n**2, self.n))
-
-    def keep(self, values: list[Value]) -> None:
-        self.v.store(values, self.begin, range(self.n))
-
-
-class _LaneWriter:
-    """Writes a function of many trials, of which a lane holds one, a group of them at a time: it
-    takes pointers, the number of trials, further whole numbers and a frame."""
-
-    def __init__(self, name: str, n: int, pointers: int, numbers: int, width: int) -> None:
-        self.n = n
-        self.module = ir.Module(name)
-        kinds = [*[PTR] * pointers, I64, *[I64] * numbers, PTR]
-        made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), name)
-        self.arrays = made.args[:pointers]
-        self.trials, *self.numbers, self.frame = made.args[pointers:]
-        self.b: Any = ir.IRBuilder(made.append_basic_block())
-        self.v = _Vectors(self.b, width)
-        self.zero = self.v.constant(0.0)
-        self.one = self.v.constant(1.0)
-
-    def _write(self, solve: Callable[[], None]) -> None:
-        """Writes what is done with each group."""
-        with loop(self.b, integer(0), self.trials, self.v.width) as self.group:
-            solve()
-        self.b.ret_void()
-
-    def _take(self, array: Value, lanes: _Lanes, count: int, k: Value, length: Value) -> None:
-        """Copies `count` numbers of epoch k of an array (trials, length, count) into lanes."""
-        rows = self._rows(array, count, k, length)
-        with self._each(count) as j:
-            vector = ir.Constant(self.v.type, ir.Undefined)
-            for lane, row in enumerate(rows):
-                number = number_at(self.b, row, j)
-                vector = self.b.insert_element(vector, number, ir.Constant(I32, lane))
-            lanes[j] = vector
-
-    def _give(self, lanes: _Lanes, array: Value, count: int, k: Value, length: Value) -> None:
-        """Copies lanes into `count` numbers of epoch k of an array (trials, length, count)."""
-        rows = self._rows(array, count, k, length)
-        with self._each(count) as j:
-            vector = lanes[j]
-            for lane, row in enumerate(rows):
-                put(self.b, self.b.extract_element(vector, ir.Constant(I32, lane)), row, j)
-
-    def _rows(self, array: Value, count: int, k: Value, length: Value) -> list[Value]:
-        """Begins of epoch k of each lane's trial in an array (trials, length, count)."""
-        b = self.b
-        last = b.sub(self.trials, integer(1))
-        rows = []
-        for lane in range(self.v.width):
-            trial = b.add(self.group, integer(lane))
-            # A group that is not full repeats the last trial.
-            trial = b.select(b.icmp_signed("<", trial, last), trial, last)
-            epoch = b.add(b.mul(trial, length), k)
-            begin = b.mul(epoch, integer(count))
-            rows.append(b.gep(array, [begin], source_etype=F64))
-        return rows
-
-    def _parts(self, array: Value, sizes: Sequence[int]) -> list[Value]:
-        """Begins of parts of so many vectors each, and of what follows them."""
-        return [self.v.place(array, begin) for begin in itertools.accumulate(sizes, initial=0)]
-
-    def _lanes(self, begin: Value) -> _Lanes:
-        return _Lanes(self.v, begin, self.n)
-
-    def _each(self, count: int | Value) -> Any:
-        count = integer(count) if isinstance(count, int) else count
-        return loop(self.b, integer(0), count)
-
-    @contextmanager
-    def _down(self, count: Value) -> Iterator[Value]:
-        """Writes a loop from count - 1 down to 0."""
-        with self._each(count) as i:
-            last = self.b.sub(count, integer(1))
-            yield self.b.sub(last, i)
-
-    def _dot(
-        self, one: Sequence[Value], other: Sequence[Value], start: Value | None = None
-    ) -> Value:
-        slopes = [[value] for value in other]
-        return self.v.combine([start or self.zero], list(one), slopes)[0]
-
-
-class _ChainWriter(_LaneWriter):
-    """Writes the solver of chains of one size: a square-root filter, and a pass back by
-    multipliers. What is given of all trials has a name of `self`, as `self.A`; what lies in the
-    frame has one of its epoch, as `here.A`."""
-
-    def __init__(self, size: ChainSize, width: int) -> None:
-        super().__init__("chains", size.n, pointers=9, numbers=1, width=width)
-        self.size = size
-        self.rows = size.m + size.n
-        (self.epochs,) = self.numbers
-        self.A, self.B, self.D, self.G, self.a, self.values, *results = self.arrays
-        self.x, self.P, self.crossed = results
-        W, t, y, told, ahead, product, self.first = self._parts(self.frame, size.working)
-        self.W = _Lanes(self.v, W, size.n + size.q)
-        self.seen = _Lanes(self.v, W, size.n + size.m)
-        parts = map(self._lanes, (t, y, told, ahead, product))
-        self.t, self.y, self.told, self.ahead, self.product = parts
-        self._write(self._solve)
-
-    def _solve(self) -> None:
-        """Writes the solution of a group of trials."""
-        with self._each(self.epochs) as k:
-            self._begin(k)
-            self._spread(k)
-        with self._asked(self.x):
-            # The second pass solves for what the first leaves of the right sides.
-            with self._each(2):
-                self._pass()
-            with self._each(self.epochs) as k:
-                self._give(self._at(k).x, self.x, self.n, k, self.epochs)
-        with self._asked(self.P):
-            self._covariances()
-
-    def _pass(self) -> None:
-        """Writes one pass along a path, there and back."""
-        with self._each(self.epochs) as k:
-            self._forward(k)
-        # Nothing follows the last epoch: A' l = 0.
-        with self._each(self.n) as i:
-            self.y[i] = self.zero
-        with self._down(self.epochs) as k:
-            self._backward(k)
-        with self._each(self.epochs) as k:
-            self._refine(k)
-
-    def _begin(self, k: Value) -> None:
-        """Writes what is given of an epoch into its place."""
-        b = self.b
-        n = self.n
-        m = self.size.m
-        here = self._at(k)
-        moved = b.sub(self.epochs, integer(1))
-        before = b.sub(k, integer(1))
-        # Nothing moves into the first epoch, and nothing is read there; nor is anything left there
-        # of the trials before, which may not be finite.
-        with self._each(n * n) as i:
-            here.A[i] = self.zero
-        with self._each(m) as r:
-            here.v[r] = self.zero
-        with b.if_then(b.icmp_signed(">", k, integer(0))):
-            self._take(self.A, here.A, n * n, before, moved)
-            self._take(self.B, here.B, m * n, before, moved)
-            self._take(self.values, here.v, m, before, moved)
-        # D waits where u will be.
-        self._take(self.D, here.u, n, k, self.epochs)
-        self._take(self.a, here.a, n, k, self.epochs)
-        with self._each(n) as i:
-            self._damp(here, i)
-
-    def _damp(self, here: Epoch, i: Value) -> None:
-        """Writes the row of a root of D for state i, which is a reading of 0, as one that is not
-        taken in yet."""
-        b = self.b
-        m = integer(self.size.m)
-        # The roots stand on a diagonal below the rows of the m readings.
-        diagonal = b.add(integer(self.size.m * self.n), b.mul(i, integer(self.n + 1)))
-        here.B[diagonal] = self.v.call("sqrt", here.u[i])
-        here.x[i] = self.zero
-        here.v[b.add(i, m)] = self.zero
-
-    def _spread(self, k: Value) -> None:
-        """Writes F of an epoch: predicted, and then updated by one row after another."""
-        here = self._at(k)
-        before = self._at(k, back=1)
-        self._predict(k, here.A, before.F)
-        self._triangle(self.W, here.F)
-        with self._each(self.rows) as r, self._counts(here, r):
-            self._take_in(here, here.F, here.B.row(r).all(), r)
-
-    def _predict(self, k: Value, A: _Lanes, F: _Lanes) -> None:
-        """Writes W = (A F, G), with W W' = A F F' A' + G G'."""
-        with self._each(self.n) as i:
-            along = A.row(i).all()
-            row = self.W.row(i)
-            moved = [self.zero] * self.n
-            # F is triangular: row j of it has j + 1 numbers.
-            for j, share in enumerate(along):
-                begun = j * self.n
-                kept = self.v.load(F.begin, range(begun, begun + j + 1))
-                moved[: j + 1] = self.v.combine(moved[: j + 1], [share], [kept])
-            self.v.store(moved, row.begin, range(self.n))
-            with self._each(self.size.q) as j:
-                gain = self._gain(k, i, j)
-                row[self.b.add(j, integer(self.n))] = gain
-
-    def _triangle(self, W: _Lanes, F: _Lanes) -> None:
-        """Writes the triangular F with F F' = W W', by orthogonal rows of W (modified
-        Gram-Schmidt)."""
-        b = self.b
-        with self._each(self.n) as i:
-            row = W.row(i).all()
-            square = self._dot(row, row)
-            # Singular noise leaves rows of zeros, which have no share in others.
-            some = b.fcmp_ordered(">", square, self.zero)
-            inverse = b.select(some, b.fdiv(self.one, square), self.zero)
-            root = self.v.call("sqrt", square)
-            F.row(i)[i] = root
-            # The rows below lose their part along row i.
-            with loop(b, b.add(i, integer(1)), integer(self.n)) as j:
-                below = W.row(j)
-                numbers = below.all()
-                share = b.fmul(self._dot(numbers, row), inverse)
-                F.row(j)[i] = b.fmul(share, root)
-                rest = self.v.combine(numbers, [b.fneg(share)], [row])
-                below.keep(rest)
-
-    def _counts(self, here: Epoch, r: Value) -> Any:
-        """Begins what is done with row r if it counts: a reading always, and damping if some lane
-        has any; w and s of another row are 0."""
-        b = self.b
-        m = integer(self.size.m)
-        read = b.icmp_signed("<", r, m)
-        damping = b.icmp_signed(">=", r, m)
-        i = b.select(damping, b.sub(r, m), integer(0))
-        damped = b.fcmp_unordered("!=", here.B.row(r)[i], self.zero)
-        lanes = b.bitcast(damped, ir.IntType(self.v.width))
-        some = b.icmp_unsigned("!=", lanes, ir.Constant(lanes.type, 0))
-        return b.if_then(b.or_(read, some))
-
-    def _take_in(self, here: Epoch, F: _Lanes, row: list[Value], r: Value) -> None:
-        """Writes F F' <- ((F F')^-1 + b b')^-1 for a row b, with s = F F' b and 1 + b' s (Carlson,
-        1973) in the places of row r of an epoch."""
-        b = self.b
-        s = here.S.row(r)
-        # t = F' b, of which s and 1 + b' s are sums over columns.
-        with self._each(self.n) as j:
-            self.t[j] = self._dot(F.column(j), row)
-            s[j] = self.zero
-        here.size[r] = self.one
-        # From the last column to the first, size is 1 plus the squares of t so far.
-        with self._down(integer(self.n)) as j:
-            t = self.t[j]
-            size = here.size[r]
-            larger = self.v.call("fma", t, t, size)
-            root = self.v.call("sqrt", b.fmul(size, larger))
-            kept = b.fdiv(size, root)
-            share = b.fneg(b.fdiv(t, root))
-            # F <- F size / root - s t / root in this column, then s <- s + F t by the old one.
-            with loop(b, j, integer(self.n)) as i:
-                old = F.row(i)[j]
-                so_far = s[i]
-                new = self.v.call("fma", share, so_far, b.fmul(old, kept))
-                F.row(i)[j] = new
-                s[i] = self.v.call("fma", old, t, so_far)
-            here.size[r] = larger
-
-    def _forward(self, k: Value) -> None:
-        """Writes the state u of an epoch by its readings and those before."""
-        here = self._at(k)
-        before = self._at(k, back=1).u.all()
-        # Prediction: u <- A u + a.
-        with self._each(self.n) as i:
-            along = here.A.row(i).all()
-            here.u[i] = self._dot(along, before, here.a[i])
-        # Update by a reading: w = (v - b' u) / (1 + b' s), then u <- u + s w.
-        with self._each(self.rows) as r, self._counts(here, r):
-            w = self.b.fdiv(self._left(here, r), here.size[r])
-            here.w[r] = w
-            self._add(w, here.S.row(r), here.u)
-
-    def _backward(self, k: Value) -> None:
-        """Writes the multipliers of an epoch, and its state by all readings."""
-        here = self._at(k)
-        later = self.y.all()
-        # Smoothing (Bryson and Frazier, 1963): x = u + F t with t = F' A' l[k+1].
-        with self._each(self.n) as j:
-            self.t[j] = self._dot(here.F.column(j), later)
-        with self._each(self.n) as i:
-            t = self.t.all()
-            along = here.F.row(i).all()
-            here.u[i] = self._dot(along, t, here.u[i])
-            here.x[i] = self.b.fadd(here.x[i], here.u[i])
-        # Readings from the last to the first: w <- w - s' l / (1 + b' s), then l <- l + b w.
-        with self._down(integer(self.rows)) as r, self._counts(here, r):
-            known = self._along(here.S, r, self.y)
-            share = self.b.fdiv(known, here.size[r])
-            w = self.b.fsub(here.w[r], share)
-            here.w[r] = w
-            self._add(w, here.B.row(r), self.y)
-        multipliers = self.y.all()
-        here.multipliers.keep(multipliers)
-        # A' l is what the epoch before takes.
-        with self._each(self.n) as i:
-            self.y[i] = self._dot(here.A.column(i), multipliers)
-
-    def _refine(self, k: Value) -> None:
-        """Writes what u and the multipliers leave of the right sides."""
-        q = self.size.q
-        here = self._at(k)
-        before = self._at(k, back=1).u.all()
-        # t = G' l.
-        with self._each(q) as j:
-            column = [self._gain(k, integer(i), j) for i in range(self.n)]
-            self.t[j] = self._dot(column, here.multipliers.all())
-        # a <- a - u + G t + A u[k-1].
-        with self._each(self.n) as i:
-            left = self.b.fsub(here.a[i], here.u[i])
-            gains = [self._gain(k, i, integer(j)) for j in range(q)]
-            left = self._dot(gains, self.v.load(self.t.begin, range(q)), left)
-            along = here.A.row(i).all()
-            here.a[i] = self._dot(along, before, left)
-        # v <- v - B u - w.
-        with self._each(self.rows) as r, self._counts(here, r):
-            left = self._left(here, r)
-            here.v[r] = self.b.fsub(left, here.w[r])
-
-    def _covariances(self) -> None:
-        """Writes covariances from the last epoch to the first: by the readings up to an epoch or,
-        where those with the last states are asked for, by all."""
-        n = self.n
-        with self._each(n * n) as i:
-            self.told[i] = self.zero
-            self.ahead[i] = self.zero
-        with self._each(n) as i:
-            self.ahead.row(i)[i] = self.one
-        with self._down(self.epochs) as k:
-            F = self._at(k).F
-            with self._asked(self.crossed):
-                self._smooth(k)
-            with self._each(n) as i:
-                row = F.row(i).all()
-                with loop(self.b, integer(0), self.b.add(i, integer(1))) as j:
-                    along = self._dot(row, F.row(j).all())
-                    self.product.row(i)[j] = along
-                    self.product.row(j)[i] = along
-            self._give(self.product, self.P, n * n, k, self.epochs)
-            with self._asked(self.crossed):
-                self._tell(k)
-
-    def _smooth(self, k: Value) -> None:
-        """Writes F of an epoch by all readings: what later ones tell, U U', is as if its columns
-        were read."""
-        here = self._at(k)
-        with self._each(self.n) as j:
-            self._take_in(here, here.F, self.told.column(j), integer(0))
-
-    def _tell(self, k: Value) -> None:
-        """Writes the covariance with the last states, and what the epoch before takes of the later
-        readings."""
-        b = self.b
-        n = self.n
-        m = self.size.m
-        here = self._at(k)
-        # W waits for what is seen.
-        crossed = _Lanes(self.v, self.W.begin, n)
-        with self._each(n) as i:
-            row = self.product.row(i).all()
-            with self._each(n) as j:
-                crossed.row(i)[j] = self._dot(row, self.ahead.column(j))
-        self._give(crossed, self.crossed, n * n, k, self.epochs)
-        # C C' = B' B + U U' takes the place of F F', of which nothing is asked any more.
-        with self._each(n) as i:
-            row = self.seen.row(i)
-            with self._each(m) as r:
-                row[r] = here.B.row(r)[i]
-            with self._each(n) as j:
-                row[b.add(j, integer(m))] = self.told.row(i)[j]
-        self._triangle(self.seen, here.F)
-        with self._each(self.size.q) as j:
-            self._blur(k, j)
-        # U <- A' C, and what leads to the last states likewise.
-        self._lead(here, here.F, self.told)
-        self._lead(here, self.ahead, self.product)
-        with self._each(n * n) as i:
-            self.ahead[i] = self.product[i]
-
-    def _blur(self, k: Value, j: Value) -> None:
-        """Writes C C' <- ((C C')^-1 + g g')^-1 for a column g of G, s = C C' g, and ahead <- (I - s
-        g' / (1 + g' s)) ahead."""
-        here = self._at(k)
-        g = [self._gain(k, integer(i), j) for i in range(self.n)]
-        self._take_in(here, here.F, g, integer(0))
-        with self._each(self.n) as c:
-            along = self._dot(g, self.ahead.column(c))
-            share = self.b.fneg(self.b.fdiv(along, here.size[integer(0)]))
-            with self._each(self.n) as i:
-                row = self.ahead.row(i)
-                row[c] = self.v.call("fma", share, here.S[i], row[c])
-
-    def _lead(self, here: Epoch, given: _Lanes, to: _Lanes) -> None:
-        """Writes A' times a matrix."""
-        with self._each(self.n) as i:
-            along = here.A.column(i)
-            with self._each(self.n) as j:
-                to.row(i)[j] = self._dot(along, given.column(j))
-
-    def _asked(self, array: Value) -> Any:
-        return self.b.if_then(self.b.icmp_signed("!=", self.b.ptrtoint(array, I64), integer(0)))
-
-    def _at(self, k: Value, back: int = 0) -> Epoch:
-        """What is kept of epoch k - back. Before the first epoch lies one of zeros."""
-        number = self.b.add(k, integer(1 - back))
-        begin = self.b.mul(number, integer(sum(self.size.parts)))
-        *places, _ = self._parts(self.v.place(self.first, begin), self.size.parts)
-        return Epoch(*map(self._lanes, places))
-
-    def _gain(self, k: Value, i: Value, j: Value) -> Value:
-        """G[k, i, j], the same in all lanes."""
-        b = self.b
-        row = b.add(b.mul(k, integer(self.n)), i)
-        place = b.add(b.mul(row, integer(self.size.q)), j)
-        return self.v.spread(number_at(b, self.G, place))
-
-    def _left(self, here: Epoch, r: Value) -> Value:
-        """What u leaves of reading r, v - b' u."""
-        return self.b.fsub(here.v[r], self._along(here.B, r, here.u))
-
-    def _along(self, array: _Lanes, r: Value, x: _Lanes) -> Value:
-        """Row r of an array times x."""
-        return self._dot(array.row(r).all(), x.all())
-
-    def _add(self, share: Value, row: _Lanes, to: _Lanes) -> None:
-        """Writes to <- to + share row."""
-        with self._each(self.n) as i:
-            to[i] = self.v.call("fma", share, row[i], to[i])
 
 
 class _Writer:
@@ -926,6 +502,34 @@ class _Vectors:
     def store(self, values: Sequence[Value], frame: Value, places: Iterable[int]) -> None:
         for value, i in zip(values, places, strict=True):
             self.builder.store(value, self.place(frame, i), align=8 * self.width)
+
+    def load_at(self, array: Value, index: Value) -> Value:
+        """Loads numbers that lie side by side anywhere."""
+        place = self.builder.gep(array, [index], source_etype=F64)
+        return self.builder.load(place, typ=self.type, align=8)
+
+    def store_at(self, value: Value, array: Value, index: Value) -> None:
+        self.builder.store(value, self.builder.gep(array, [index], source_etype=F64), align=8)
+
+    def turned(self, square: list[Value]) -> list[Value]:
+        """Makes columns of the rows of a square matrix, by blocks of 1, 2, 4 numbers."""
+        lanes = range(self.width)
+        by = 1
+        while by < self.width:
+            upper = [i if not i & by else self.width + i - by for i in lanes]
+            lower = [i + by if not i & by else self.width + i for i in lanes]
+            for i in lanes:
+                if not i & by:
+                    one = square[i]
+                    other = square[i + by]
+                    square[i] = self._shuffled(one, other, upper)
+                    square[i + by] = self._shuffled(one, other, lower)
+            by *= 2
+        return square
+
+    def _shuffled(self, one: Value, other: Value, places: list[int]) -> Value:
+        mask = ir.Constant(ir.VectorType(I32, self.width), places)
+        return self.builder.shuffle_vector(one, other, mask)
 
     def constant(self, value: float) -> Value:
         return ir.Constant(self.type, [value] * self.width)

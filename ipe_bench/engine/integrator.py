@@ -30,7 +30,6 @@ from ipe_bench.engine.trace import Program, RowPrograms
 if TYPE_CHECKING:
     # Imported where something is compiled, and here so that results are known to depend on it.
     from ipe_bench.engine import emit as emit
-    from ipe_bench.engine.chains import ChainSize
 
 _WORTH_THREADS = 40_000
 """Steps times lanes times states from which a second thread gains more than it costs, some 150
@@ -58,7 +57,7 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
 
 def emitted(
     name: str,
-    source: StepPlan | Program | RowPrograms | ChainSize,
+    source: StepPlan | Program | RowPrograms,
     width: int,
     arguments: tuple[Any, ...],
 ) -> Callable[..., None]:

@@ -1,12 +1,12 @@
 """Runs recorded steps along the epochs of all trials, in machine code.
 
-    void scan(double *carry, double *each, double *shared, double *out, int64 trials, int64 first,
-    int64 by, int64 count, int64 length)
+    void scan(double *carry, double *shared, double *out, int64 trials, int64 first, int64 by, int64
+    count, int64 length, double *each, int64 its_length, int64 its_stride, ...)
 
 At epoch first, first + by, ... the step takes what is carried, the numbers of its trial and epoch
-in each (trials, length, stride) and those of its epoch in shared (length, p), and gives what is
-carried on and out (trials, length, o). A lane is a trial; a group that is not full repeats its last
-one. The bits of a trial depend on its own numbers alone.
+in one or more arrays each (trials, its_length, its_stride) and those of its epoch in shared
+(length, p), and gives what is carried on and out (trials, length, o). A lane is a trial; a group
+that is not full repeats its last one. The bits of a trial depend on its own numbers alone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ if TYPE_CHECKING:
 _LARGE = 4_000
 """Products of a matrix operation from which on it is written as loops: straight lines would take
 longer to compile than they save."""
-_ARGUMENTS = (*[POINTER] * 4, *[INTEGER] * 5)
+_ARGUMENTS = (*[POINTER] * 3, *[INTEGER] * 5)
+_OF_EACH = (POINTER, INTEGER, INTEGER)
+_BYTES = 8
+"""Of a number."""
 _FILES = [Path(__file__), Path(__file__).with_name("emit.py"), Path(__file__).with_name("trace.py")]
 
 
@@ -46,21 +49,37 @@ class Step:
     record: Callable[[], Program] = field(compare=False)
     """Records it, which is asked for only if it is not kept as machine code."""
     carried: int
-    each: int
-    """Numbers of its trial and epoch."""
-    stride: int
-    """Numbers from one epoch of them to the next."""
+    each: tuple[int, ...]
+    """Numbers of its trial and epoch, of one or more arrays."""
     shared: int
     shown: int
     """Numbers of a trial and epoch that it gives."""
 
     def run(
-        self, carry: Array, each: Array, shared: Array, out: Array, first: int, by: int, count: int
+        self,
+        carry: Array,
+        each: Sequence[Array],
+        shared: Array,
+        out: Array,
+        first: int,
+        by: int,
+        count: int,
     ) -> None:
-        """Advances carry (trials, carried) by `count` epochs."""
+        """Advances carry (trials, carried) by `count` epochs. Arrays of each (trials, length, ...)
+        that are shorter than the longest of them lack its first epochs, and the step takes the
+        first numbers of an epoch."""
         trials, length, _ = out.shape
+        if not trials or not count:
+            return
+        longest = max((one.shape[1] for one in each), default=0)
+        arrays = []
+        for one in each:
+            its_length = one.shape[1]
+            stride = one.size // (trials * its_length)
+            begin = at(one) - _BYTES * stride * (longest - its_length)
+            arrays += [begin, its_length, stride]
         run = _compiled(self)
-        run(at(carry), at(each), at(shared), at(out), trials, first, by, count, length)
+        run(at(carry), at(shared), at(out), trials, first, by, count, length, *arrays)
 
 
 @lru_cache(maxsize=256)
@@ -73,7 +92,8 @@ def _compiled(step: Step) -> Callable[..., None]:
         emit = importlib.import_module("ipe_bench.engine.emit")
         return emit.scan(step, step.record(), width)
 
-    return compiled.load(key, write, "scan", _ARGUMENTS)
+    arguments = (*_ARGUMENTS, *_OF_EACH * len(step.each))
+    return compiled.load(key, write, "scan", arguments)
 
 
 Matrix = Sequence[Sequence[Any]]

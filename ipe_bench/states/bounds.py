@@ -8,9 +8,9 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.engine.chains import lower, smoothed_chains
 from ipe_bench.states.algebra import factor, half, lower_solve, triangular
 from ipe_bench.states.base import Paths, StateModel
+from ipe_bench.states.chains import Noise, Tangents
 from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.trackers import Tracks, filtered, smoothed
 
@@ -54,7 +54,7 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
             else:
                 begun = root
             # By Woodbury, D22 - D21 (J + D11)^-1 D12 is the inverse of F P F' + Q.
-            root = lower(np.concatenate([F_mean @ root, G], axis=1)[None])[0]
+            root = _lower(np.concatenate([F_mean @ root, G], axis=1))
         H, R = _seen(model.observation_at(k).slope(at)[1], R, paths.z[:, k])
         gained = _mean_rows(H, R)
         root = _informed(root, gained)
@@ -79,22 +79,33 @@ def _smoothed(start: Array, steps: list[_Step]) -> Array:
     """Computes the covariances (K, n, n) of the smoother of such a model, from a root of the states
     before the first transition."""
     A = np.stack([step.F for step in steps])
-    G = np.stack([start, *(step.G for step in steps)])
     B = np.zeros((len(steps), 2 * len(start), len(start)))
     for rows, step in zip(B, steps, strict=True):
         rows[: len(step.told)] = step.told
-    return smoothed_chains(A[None], B[None], G)[0][0, 1:]
+    noise = Noise(start, np.stack([step.G for step in steps]))
+    return noise.spread(Tangents(A[None], B[None])).covariance[0, 1:]
 
 
 def _informed(root: Array, rows: Array) -> Array:
     """Returns a root (n, n) of the covariance of states whose information has these rows (r, n)
     beside, by orthogonal rows of (I, rows F; 0, F)."""
     r, n = rows.shape
-    before = np.zeros((1, r + n, r + n))
-    before[0, :r, :r] = np.eye(r)
-    before[0, :r, r:] = rows @ root
-    before[0, r:, r:] = root
-    return lower(before)[0, r:, r:]
+    before = np.zeros((r + n, r + n))
+    before[:r, :r] = np.eye(r)
+    before[:r, r:] = rows @ root
+    before[r:, r:] = root
+    return _lower(before)[r:, r:]
+
+
+def _lower(W: Array) -> Array:
+    """Computes a lower triangular F (n, n) with F F' = W W', by reflections of Householder."""
+    n, columns = W.shape
+    # Sizes of columns may differ by all digits; without the largest ones in front, reflections
+    # would lose those of the smaller ones (Powell and Reid, IFIP Congress 68, 1969).
+    order = np.argsort(-np.sum(W**2, axis=0), kind="stable")
+    V = np.zeros((max(n, columns), n))
+    V[:columns] = W[:, order].T
+    return np.asarray(np.linalg.qr(V, mode="r")).T
 
 
 def _regular(model: StateModel, k: int) -> Array:
@@ -126,7 +137,7 @@ def _mean_rows(J: Array, C: Array) -> Array:
     one C or one for each path."""
     whitened = lower_solve(factor(C), J)
     rows = whitened.reshape(-1, J.shape[-1]) / np.sqrt(len(J))
-    return lower(rows.T[None])[0].T
+    return _lower(rows.T).T
 
 
 def bound_at_truth(model: StateModel, paths: Paths, smooths: bool = False) -> Array:

@@ -296,4 +296,4 @@ def reported(density: PathDensity, paths: Descent) -> tuple[Tracks, Array]:
     out.iterations = paths.iterations
     of_tangents = Taylor().calls(model.n) * model.evaluations
     out.calls = paths.calls + at.calls + around.calls + of_tangents
-    return out, np.log(around.mass) - density.log_determinant(tangents) / 2
+    return out, np.log(around.mass) - around.log_determinant / 2

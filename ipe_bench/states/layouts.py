@@ -17,7 +17,7 @@ from ipe_bench.engine import compiled
 from ipe_bench.engine.scan import Step
 from ipe_bench.engine.trace import Graph, Program
 
-_NAMES = ("layouts.py", "linearisation.py", "passes.py", "steps.py")
+_NAMES = ("chains.py", "layouts.py", "linearisation.py", "passes.py", "steps.py")
 _FILES = [Path(__file__).with_name(name) for name in _NAMES]
 
 Shape: TypeAlias = "int | tuple[tuple[bool, ...], ...]"
@@ -83,20 +83,19 @@ def named_step(
     text: Callable[..., Mapping[str, Any]],
     what: Any,
     carried: Layout,
-    each: Layout,
+    each: Sequence[Layout],
     shared: Layout,
     shown: Layout,
-    stride: int = 0,
 ) -> Step:
-    """Returns the step of a text, which takes the named parts of what is carried, of its trial and
-    of its epoch, and gives those that are carried on and shown. It is recorded only if its machine
-    code is not kept; `what` tells it from other texts of these layouts."""
+    """Returns the step of a text, which takes the named parts of what is carried, of arrays of its
+    trial and of its epoch, and gives those that are carried on and shown. It is recorded only if
+    its machine code is not kept; `what` tells it from other texts of these layouts."""
 
     def record() -> Program:
         graph = Graph()
         inputs = []
         parts = {}
-        for number, layout in enumerate((carried, each, shared)):
+        for number, layout in enumerate((carried, *each, shared)):
             unknowns = graph.inputs(f"{number} ", layout.size)
             parts |= layout.parts(unknowns)
             inputs += unknowns
@@ -107,7 +106,7 @@ def named_step(
 
     digests = [compiled.digest_of(file) for file in _FILES]
     key = repr((what, carried, each, shared, shown, digests))
-    sizes = (carried.size, each.size, stride or each.size, shared.size, shown.size)
+    sizes = (carried.size, tuple(one.size for one in each), shared.size, shown.size)
     return Step(hashlib.sha256(key.encode()).hexdigest(), record, *sizes)
 
 

@@ -188,10 +188,10 @@ def _spread(m: Array, F: Array, s: Array) -> Array:
     trials, n = m.shape
     states = Layout(x=n, F=triangle(n))
     at = Layout(s=n)
-    step = _along_points(_spread_text, states, _NOTHING, at, Layout(y=n))
+    step = _along_points(_spread_text, states, (), at, Layout(y=n))
     carry = np.concatenate([m, packed(F)], axis=1)
     points = np.empty((trials, *s.shape))
-    step.run(carry, _NONE, s, points, 0, 1, len(s))
+    step.run(carry, [], s, points, 0, 1, len(s))
     return points
 
 
@@ -214,13 +214,13 @@ def _regressed(y: Array, mean: Array, s: Array, c: Array) -> tuple[Array, Array]
     sums = Layout(mean=m, M=full(m, n))
     carry = np.concatenate([mean, np.zeros((trials, m * n))], axis=1)
     out = np.empty((trials, points, 0))
-    step = _along_points(_slopes_text, sums, values, at, _NOTHING)
-    step.run(carry, y, weighted, out, 0, 1, points)
+    step = _along_points(_slopes_text, sums, (values,), at, _NOTHING)
+    step.run(carry, [y], weighted, out, 0, 1, points)
     M = sums.part(carry, "M", m, n)
     rest = Layout(**sums.shapes, W=full(m, m))
     carry = np.concatenate([carry, np.zeros((trials, m * m))], axis=1)
-    step = _along_points(_rest_text, rest, values, at, _NOTHING)
-    step.run(carry, y, weighted, out, 0, 1, points)
+    step = _along_points(_rest_text, rest, (values,), at, _NOTHING)
+    step.run(carry, [y], weighted, out, 0, 1, points)
     return M, rest.part(carry, "W", m, m)
 
 
@@ -243,7 +243,11 @@ def _rest_text(mean: Any, M: Any, W: Any, y: Any, s: Any, c: Any) -> dict[str, A
 
 @functools.cache
 def _along_points(
-    text: Callable[..., Any], carried: Layout, each: Layout, shared: Layout, shown: Layout
+    text: Callable[..., Any],
+    carried: Layout,
+    each: tuple[Layout, ...],
+    shared: Layout,
+    shown: Layout,
 ) -> Step:
     return named_step(text, text.__name__, carried, each, shared, shown)
 

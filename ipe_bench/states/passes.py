@@ -194,7 +194,7 @@ class _Form:
         sizes = self.sizes
         # A rule of a plugin may get other points by the same name: the numbers tell.
         what = (self, numbers_of(self.kind.rule, sizes.n))
-        return named_step(self.text, what, sizes.carried, self.each, self.shared, sizes.shown)
+        return named_step(self.text, what, sizes.carried, [self.each], self.shared, sizes.shown)
 
     def text(
         self,
@@ -346,8 +346,7 @@ class Passes(ABC):
     @cached_property
     def _back(self) -> Step:
         told = self.sizes.told
-        layouts = (self.sizes.unit, told, _NOTHING, self.sizes.back)
-        return named_step(_back, "back", *layouts, stride=self.sizes.shown.size)
+        return named_step(_back, "back", self.sizes.unit, [told], _NOTHING, self.sizes.back)
 
     def run(self, z: Array, route: Route | None, start: Normal | None) -> Passed:
         """Passes along readings z (trials, K, m) from the prior, or from other starts."""
@@ -370,7 +369,7 @@ class Passes(ABC):
         after = np.zeros((trials, sizes.unit.size))
         after[:, sizes.unit.at["S"]] = packed(np.eye(sizes.n))
         back = np.empty((trials, 1 + K, sizes.back.size))
-        self._back.run(after, shown, _NONE, back, K, -1, 1 + K)
+        self._back.run(after, [shown], _NONE, back, K, -1, 1 + K)
         return Passed(shown, carry, back)
 
 
@@ -420,7 +419,7 @@ class _Together(Passes):
             before = np.concatenate([route.mean, route.root], axis=2)
             each = np.concatenate([z, np.roll(before, 1, axis=1), before], axis=2)
         for step, shared, first, count in self.runs:
-            step.run(carry, each, shared, shown, first, 1, count)
+            step.run(carry, [each], shared, shown, first, 1, count)
 
 
 def _programs(recording: Recording) -> RowPrograms:
@@ -468,7 +467,7 @@ class _ByEpoch(Passes):
             shown = self.sizes.shown
         recorded = partial(text, smooths=smooths)
         what = text.__name__, smooths
-        return named_step(recorded, what, self.sizes.carried, each, _NOTHING, shown)
+        return named_step(recorded, what, self.sizes.carried, [each], _NOTHING, shown)
 
     def there(self, z: Array, route: Route | None, carry: Array, shown: Array) -> None:
         n = self.sizes.n
@@ -548,7 +547,7 @@ class _ByEpoch(Passes):
         parts = [part.reshape(trials, -1) for part in (*before, noise, *after)]
         each = np.concatenate(parts, axis=1)[:, None]
         out = np.empty((trials, 1, step.shown))
-        step.run(carry, each, _NONE, out, 0, 1, 1)
+        step.run(carry, [each], _NONE, out, 0, 1, 1)
         return out[:, 0]
 
 

@@ -127,7 +127,7 @@ class IteratedSmoother(Tracker):
             end = density.settled_exactly(end)
             x = end.x
             calls = calls + end.calls
-        P, _ = density.spread(tangents)
+        P = density.spread(tangents).covariance
         P[density.beyond_digits(tangents, x)] = np.nan
         out = Tracks.empty(model, len(x))
         out.start = Normal(x[:, 0], P[:, 0])

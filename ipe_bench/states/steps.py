@@ -28,6 +28,8 @@ _SMALL = 1e-14
 _HIDDEN = 0.01
 """Square of the part of a state that counts beside its deviation: half a unit in the last place of
 the state is lost, one of the covariance in each step."""
+BEYOND = 1e25
+"""Doubt of an update above which round-off counts beside what readings leave."""
 
 Number: TypeAlias = Any
 """A float, an array of them or an expression."""

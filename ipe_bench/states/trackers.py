@@ -23,7 +23,7 @@ from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
 from ipe_bench.states.passes import Kind, Passed, Passes, Route, passes
 from ipe_bench.states.redone import believed
-from ipe_bench.states.roots import BEYOND
+from ipe_bench.states.steps import BEYOND
 
 
 @dataclass

@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.batches import take
-from ipe_bench.basics.linalg import Array, Mask, multiply
-from ipe_bench.engine.chains import filtered_chains, smoothed_chains, solve_chains
+from ipe_bench.basics.linalg import Array, Mask, finite, multiply
 from ipe_bench.engine.rows import products
 from ipe_bench.states.algebra import (
     Half,
@@ -18,11 +16,11 @@ from ipe_bench.states.algebra import (
     half,
     lower_solve,
     mahalanobis,
-    root,
-    transposed,
+    triangular,
 )
 from ipe_bench.states.base import StateModel
-from ipe_bench.states.roots import beyond_digits, precise, solved_by_roots
+from ipe_bench.states.chains import Given, Noise, Tangents
+from ipe_bench.states.steps import BEYOND
 
 _REACHED = 1e-9
 """Part of a state by which a path may miss the range of its noise or of the prior: round-off of a
@@ -32,9 +30,6 @@ _AS_GOOD = 1e-6
 angles."""
 _UNREAD = 1e-3
 """Part of a reading's deviation by which a path may miss that range at most."""
-_ROUNDED = 1e8
-"""Deviation of what is read, in parts of that of its reading, above which steps by multipliers are
-round-off."""
 
 
 @dataclass(frozen=True)
@@ -51,16 +46,6 @@ class Settled:
     """-2 log p(path | readings) (trials,) up to a constant; infinite where that is not finite."""
     calls: Array
     """Evaluations of f and of h (trials,) that this took."""
-
-
-@dataclass(frozen=True)
-class Tangents:
-    """Holds the affine model about paths."""
-
-    A: Array
-    """df/dx (trials, K, n, n)."""
-    B: Array
-    """R^-1/2 dh/dx (trials, K, m, n); 0 of missing readings."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +75,7 @@ class PathDensity:
     """G^+ (K, q, n)."""
     short: bool
     """Whether the noise of some step does not reach every state."""
-    noise: Array
-    """G (1 + K, n, q) with that of P0 in front."""
+    noise: Noise
     start: Half
     """Of P0 (n, n)."""
     whitener: Array
@@ -117,11 +101,7 @@ class PathDensity:
         R = np.stack([model.R(k) for k in epochs])
         L = factor(np.where(both, R, one))
         whitener = lower_solve(L, np.broadcast_to(one, L.shape))
-        first = root(model.prior.covariance)
-        columns = max(first.shape[1], gains.shape[2])
-        noise = np.zeros((1 + model.epochs, model.n, columns))
-        noise[0, :, : first.shape[1]] = first
-        noise[1:, :, : gains.shape[2]] = gains
+        noise = Noise(triangular(model.prior.covariance[None])[0], gains)
         start = half(model.prior.covariance)
         return cls(model, z, gains, inverses, short, noise, start, whitener)
 
@@ -264,57 +244,16 @@ class PathDensity:
         has none; with D = diag(damping (trials, 1 + K, n))."""
         # The right sides: m0 - x0, then -d_k, and H' R^-1 r = B' v.
         a = np.concatenate([self.model.prior.mean - at.x[:, :1], -at.gap], axis=1)
-        D = np.zeros_like(a) if damping is None else damping
-        v = at.residual
-        x = solve_chains(tangents.A, tangents.B, D, self.noise, a, v)
-        rows = self._rounded(tangents)
-        if rows.size:
-            of = take(tangents, rows)
-            x[rows] = solved_by_roots(of.A, of.B, D[rows], self.noise, a[rows], v[rows])
-        return x
+        return self.noise.states(tangents, a, at.residual, damping)
 
-    def _rounded(self, tangents: Tangents) -> NDArray[np.intp]:
-        """Returns the trials whose steps by multipliers are round-off: readings are so precise
-        beside what is known without any."""
-        largest = np.abs(tangents.B).max(axis=(1, 2, 3)) * np.abs(self.noise).max(initial=0.0)
-        rows = np.flatnonzero(largest > _ROUNDED)
-        if not rows.size:
-            return rows
-        of = take(tangents, rows)
-        blind = self.blind_variances(of)
-        return rows[precise(of.B, blind[:, 1:], np.ones(of.B.shape[:3]), _ROUNDED**2)]
+    def spread(self, tangents: Tangents) -> Given:
+        """Computes what all readings say of the states of the affine model."""
+        return self.noise.spread(tangents)
 
     def beyond_digits(self, tangents: Tangents, x: Array) -> Mask:
         """Tells about which paths x (trials, 1 + K, n) readings are so precise that no digits are
-        left of what they say (trials,)."""
-        P = np.diagonal(self.predicted(tangents), axis1=2, axis2=3)
-        return beyond_digits(tangents.B, x[:, 1:], P, np.ones(tangents.B.shape[:3]))
-
-    def filtered(self, tangents: Tangents) -> Array:
-        """Computes the covariances (trials, 1 + K, n, n) of the affine model's states by the
-        readings up to each epoch."""
-        return filtered_chains(tangents.A, tangents.B, self.noise)
-
-    def predicted(self, tangents: Tangents) -> Array:
-        """Computes the covariances A P A' + Q (trials, K, n, n) of the affine model's states before
-        the readings of each epoch."""
-        A = tangents.A
-        P = self.filtered(tangents)[:, :-1]
-        Q = np.matmul(self.gains, transposed(self.gains))
-        return np.matmul(np.matmul(A, P), transposed(A)) + Q
-
-    def spread(self, tangents: Tangents) -> tuple[Array, Array]:
-        """Computes the covariances P (trials, 1 + K, n, n) of the states of the affine model, and
-        those of them with the last states."""
-        return smoothed_chains(tangents.A, tangents.B, self.noise)
-
-    def log_determinant(self, tangents: Tangents) -> Array:
-        """Computes log det (trials,) of the Hessian of Gauss and Newton of J / 2, in whitened start
-        and noise: the sum of log det (I + B S B') over the epochs, S = A P A' + Q predicted."""
-        B = tangents.B
-        S = self.predicted(tangents)
-        innovation = np.matmul(np.matmul(B, S), transposed(B)) + np.eye(B.shape[2])
-        return np.linalg.slogdet(innovation)[1].sum(axis=1)
+        left of what they say (trials,), or that are not finite."""
+        return (self.noise.doubt(tangents, x) > BEYOND) | ~finite(x)
 
     def size(self, tangents: Tangents, step: Array) -> Array:
         """Computes dx' (Hessian of Gauss and Newton) dx (trials,): a step's squared length in
@@ -329,8 +268,7 @@ class PathDensity:
     def blind_variances(self, tangents: Tangents) -> Array:
         """Computes the variances (trials, 1 + K, n) of states that nothing is read of, along
         paths."""
-        blind = replace(tangents, B=np.zeros_like(tangents.B))
-        return np.diagonal(self.filtered(blind), axis1=2, axis2=3)
+        return self.noise.blind_variances(tangents)
 
 
 def _squared(a: Array) -> Array:

@@ -50,12 +50,12 @@ class Conditional(NamedTuple):
 
     @classmethod
     def of(cls, density: PathDensity, tangents: Tangents, g: Array) -> Conditional:
-        P, crossed = density.spread(tangents)
+        P, crossed, size = density.spread(tangents)
         c = np.matmul(crossed, g[:, None, :, None])[..., 0]
         variance = np.sum(g * c[:, -1], axis=1)
         line = c / variance[:, None, None]
         rest = P - c[..., :, None] * line[..., None, :]
-        return cls(rest, line, density.log_determinant(tangents) + np.log(variance))
+        return cls(rest, line, size + np.log(variance))
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,17 @@ class Around:
     density is not normal."""
     mass: Array
     """Integral of the density over that of the normal one of the affine model (trials,)."""
+    log_determinant: Array
+    """Of the Hessian of half the cost in start and noise (trials,), by the affine model."""
     calls: Array
     """Evaluations (trials,) that this took."""
 
     @classmethod
     def empty(cls, x: Array) -> Around:
         """Returns what is to be filled for paths x (trials, 1 + K, n)."""
-        return cls(np.empty((*x.shape, x.shape[-1])), np.ones(len(x)), np.zeros(len(x)))
+        return cls(
+            np.empty((*x.shape, x.shape[-1])), np.ones(len(x)), np.zeros(len(x)), np.zeros(len(x))
+        )
 
 
 def widened(density: PathDensity, at: Settled, tangents: Tangents) -> Around:
@@ -95,18 +99,20 @@ def widened(density: PathDensity, at: Settled, tangents: Tangents) -> Around:
         found = _of_some(density.subset(i), take(at, i), take(tangents, i))
         out.P[i] = found.P
         out.mass[i] = found.mass
+        out.log_determinant[i] = found.log_determinant
         out.calls[i] = found.calls
     return out
 
 
 def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> Around:
     trials, epochs, n = at.x.shape
-    P, crossed = density.spread(tangents)
+    P, crossed, size = density.spread(tangents)
     lines, axes = _lines(P[:, -1], crossed)
     sides = np.stack([lines, -lines], axis=1).reshape(-1, epochs, n)
     owner = np.repeat(np.arange(trials), 2 * n)
     moved = density.subset(owner).settled(at.x[owner] + _FAR * sides)
-    out = Around(P, np.ones(trials), moved.calls.reshape(trials, 2 * n).sum(axis=1))
+    calls = moved.calls.reshape(trials, 2 * n).sum(axis=1)
+    out = Around(P, np.ones(trials), size, calls)
     # dJ / c^2 is 1 where the density is normal.
     rise = (moved.cost - at.cost[owner]).reshape(trials, 2, n) / _FAR**2
     unlike = np.abs(rise - 1.0).max(axis=1)
@@ -187,4 +193,4 @@ def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -
             rows = rows[going]
             x = there.x[going]
             line = here.line[going]
-    return Around(moment / total[:, None, None, None], total / _OF_NORMAL, calls)
+    return Around(moment / total[:, None, None, None], total / _OF_NORMAL, middle.size, calls)

@@ -11,12 +11,11 @@ from contextlib import contextmanager
 from unittest.mock import patch
 
 import numpy as np
-from shared import chains_by_numpy
 
-from ipe_bench.engine import chains
 from ipe_bench.engine.integrator import Kernel
 from ipe_bench.engine.plan import Recording
 from ipe_bench.engine.rows import RowFunction
+from ipe_bench.engine.scan import Step
 from ipe_bench.engine.trace import Program
 
 
@@ -27,7 +26,7 @@ def by_numpy():
         patch.object(Kernel, "run", integrate),
         patch.object(RowFunction, "__call__", row_values),
         patch.object(RowFunction, "slopes", row_slopes),
-        patch.object(chains, "_run", chains_by_numpy.run),
+        patch.object(Step, "run", scanned),
     ):
         yield
 
@@ -46,6 +45,26 @@ def row_slopes(self, x, c):
     moved = self.programs.tangents([*np.eye(n)[:, :, None], *found[m:]])
     J = _joined(moved, (n, rows)).transpose(1, 2, 0)
     return _joined(found[:m], (rows,)), np.ascontiguousarray(J)
+
+
+def scanned(self, carry, each, shared, out, first, by, count):
+    """Runs a recorded step along epochs, all trials at once."""
+    longest = max((one.shape[1] for one in each), default=0)
+    for k in range(first, first + by * count, by):
+        given = list(carry.T.copy())
+        for one, size in zip(each, self.each, strict=True):
+            here = one[:, k - (longest - one.shape[1])].reshape(len(carry), -1)
+            given += list(here[:, :size].T.copy())
+        numbers = shared[k] if self.shared else ()
+        found = _recorded_step(self)([*given, *numbers])
+        joined = _joined(found, (len(carry),)) if found else np.empty((len(carry), 0))
+        carry[:] = joined[:, : self.carried]
+        out[:, k] = joined[:, self.carried :]
+
+
+@functools.cache
+def _recorded_step(step):
+    return step.record()
 
 
 def _recorded(self, x, c):

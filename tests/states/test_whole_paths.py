@@ -117,14 +117,17 @@ def test_covariances_with_the_last_states_keep_their_digits_beside_a_wide_prior(
     z = model.draw(0, 1).z
     density = PathDensity.of(model, z)
     tangents = density.tangents(density.settled(np.zeros((1, 9, model.n))))
-    P, crossed = density.spread(tangents)
-    q = density.noise.shape[2]
+    P, crossed, _ = density.spread(tangents)
+    q = model.n
+    roots = np.zeros((9, model.n, q))
+    roots[0] = density.noise.start
+    roots[1:, :, : density.gains.shape[2]] = density.gains
     T = np.zeros((9, model.n, 9 * q))
-    T[0, :, :q] = density.noise[0]
+    T[0, :, :q] = roots[0]
     rows = [np.eye(9 * q)]
     for k in range(1, 9):
         T[k] = tangents.A[0, k - 1] @ T[k - 1]
-        T[k, :, k * q : (k + 1) * q] = density.noise[k]
+        T[k, :, k * q : (k + 1) * q] = roots[k]
         rows.append(tangents.B[0, k - 1] @ T[k])
     R = np.linalg.qr(np.concatenate(rows))[1]
     Z = np.linalg.solve(R.T, T.reshape(-1, 9 * q).T).T.reshape(T.shape)
@@ -179,7 +182,7 @@ def test_a_covariance_holds_where_the_valley_of_the_cost_bends():
     w = np.exp(-(x**2 + y**2 + ((y + x**2 / 16) / 0.1) ** 2) / 2)
     exact = np.sum(w * y**2) / np.sum(w)
     density = PathDensity.of(model, z)
-    narrow, _ = density.spread(density.tangents(density.settled(whole(found)[0])))
+    narrow = density.spread(density.tangents(density.settled(whole(found)[0]))).covariance
     assert narrow[0, 0, 1, 1] < 0.6 * exact
     assert exact < found.covariance[0, 0, 1, 1] < 1.3 * exact
 

@@ -1,4 +1,4 @@
-"""Chains of epochs: against one dense system of all their equations."""
+"""Affine models about paths: against one dense system of all their equations."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from shared import chains_by_numpy
 from shared.by_numpy import by_numpy
 from shared.oracles import assert_agrees
 
-from ipe_bench.engine.chains import filtered_chains, lower, smoothed_chains, solve_chains
+from ipe_bench.states.chains import Noise, Tangents
 
 _N, _M, _EPOCHS = 3, 2, 6
 
@@ -24,6 +23,16 @@ def chains(trials, seed=0):
     G = rng.normal(size=(_EPOCHS, _N, 1))
     a, v = rng.normal(size=(trials, _EPOCHS, _N)), rng.normal(size=(trials, _EPOCHS - 1, _M))
     return A, B, D, G, a, v
+
+
+def noise(G):
+    start = np.zeros((_N, _N))
+    start[:, :1] = G[0]
+    return Noise(start, G[1:])
+
+
+def states(A, B, D, G, a, v):
+    return noise(G).states(Tangents(A, B), a, v, D)
 
 
 def equations(A, B, D, G, a, v):
@@ -63,6 +72,19 @@ def dense_covariances(A, B, G):
     return V[each, :, each], V[:, :, -1]
 
 
+def hessian(A, B, G):
+    """log det of the Hessian of half the cost in the noise."""
+    T = np.zeros((_N, _EPOCHS))
+    H = np.eye(_EPOCHS)
+    for k in range(_EPOCHS):
+        if k:
+            T = A[k - 1] @ T
+        T[:, k] = G[k, :, 0]
+        if k:
+            H += (B[k - 1] @ T).T @ (B[k - 1] @ T)
+    return np.linalg.slogdet(H)[1]
+
+
 @pytest.fixture(params=["machine code", "NumPy"])
 def engine(request):
     with by_numpy() if request.param == "NumPy" else nullcontext():
@@ -70,73 +92,58 @@ def engine(request):
 
 
 @pytest.mark.oracle(
-    "own second implementation: dense Gaussian elimination", "chains of epochs", 1e-9
+    "own second implementation: dense Gaussian elimination", "affine models about paths", 1e-9
 )
 @pytest.mark.usefixtures("engine")
 def test_a_chain_fulfils_all_its_equations_at_once():
     given = chains(11)
-    x = solve_chains(*given)
+    x = states(*given)
     A, B, D, G, a, v = given
     exact = [dense(*one[:3], G, *one[3:]) for one in zip(A, B, D, a, v, strict=True)]
     assert_agrees(x, np.array(exact), rtol=1e-9, atol=1e-9)
-
-
-def test_the_first_pass_through_a_chain_is_right_without_the_second(monkeypatch):
-    """What the second pass solves for is what the first leaves: here it is nothing, whatever the
-    first found."""
-
-    def leave_nothing(chain, _):
-        chain.a[:] = 0.0
-        chain.v[:] = 0.0
-
-    given = chains(11)
-    right = solve_chains(*given)
-    monkeypatch.setattr(chains_by_numpy, "_refine", leave_nothing)
-    np.testing.assert_allclose(chains_by_numpy.solve_chains(*given), right, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.usefixtures("engine")
 def test_a_wide_start_costs_no_digits():
     """A start of variance 1e16 that two readings settle: x is what they say, to more than half of
     the digits."""
-    A, B = np.array([[[[1.0, 1.0], [0.0, 1.0]]] * 2]), np.array([[[[1e4, 0.0]]] * 2])
-    G, nothing = np.zeros((3, 2, 2)), np.zeros((1, 3, 2))
-    G[0] = 1e8 * np.eye(2)
+    of = Tangents(np.array([[[[1.0, 1.0], [0.0, 1.0]]] * 2]), np.array([[[[1e4, 0.0]]] * 2]))
+    wide = Noise(1e8 * np.eye(2), np.zeros((2, 2, 1)))
     v = 1e4 * np.array([[[3.0], [5.0]]])
-    x = solve_chains(A, B, nothing, G, nothing, v)
-    P = filtered_chains(A, B, G)
+    x = wide.states(of, np.zeros((1, 3, 2)), v)
+    P = wide.spread(of).covariance
     np.testing.assert_allclose(x[0], [[1.0, 2.0], [3.0, 2.0], [5.0, 2.0]], rtol=1e-12)
     np.testing.assert_allclose(P[0, 2], 1e-8 * np.array([[1.0, 1.0], [1.0, 2.0]]), rtol=1e-6)
 
 
 @pytest.mark.oracle(
-    "own second implementation: the inverse of all equations", "covariances of chains", 1e-9
+    "own second implementation: the inverse of all equations", "covariances about paths", 1e-9
 )
 @pytest.mark.usefixtures("engine")
 def test_covariances_of_a_chain_are_those_of_all_its_equations_at_once():
     A, B, _, G, _, _ = chains(11)
-    P, crossed = smoothed_chains(A, B, G)
+    P, crossed, log_determinant = noise(G).spread(Tangents(A, B))
     exact = [dense_covariances(*one, G) for one in zip(A, B, strict=True)]
     assert_agrees(P, np.array([one for one, _ in exact]), rtol=1e-9, atol=1e-9)
     assert_agrees(crossed, np.array([one for _, one in exact]), rtol=1e-9, atol=1e-9)
-    # At the last epoch no reading is later.
-    np.testing.assert_array_equal(P[:, -1], filtered_chains(A, B, G)[:, -1])
+    sizes = [hessian(*one, G) for one in zip(A, B, strict=True)]
+    np.testing.assert_allclose(log_determinant, sizes, rtol=1e-12)
 
 
 @pytest.mark.usefixtures("engine")
 def test_a_state_that_later_readings_settle_costs_no_digits():
     """A start of variance 1e16 that two later readings settle: of x, p and the sum of both are
     read."""
-    A, B = np.array([[[[1.0, 1.0], [0.0, 1.0]]] * 2]), np.array([[[[1.0, 0.0]]] * 2])
-    G = np.zeros((3, 2, 2))
-    G[0] = 1e8 * np.eye(2)
-    P, _ = smoothed_chains(A, B, G)
+    of = Tangents(np.array([[[[1.0, 1.0], [0.0, 1.0]]] * 2]), np.array([[[[1.0, 0.0]]] * 2]))
+    P = Noise(1e8 * np.eye(2), np.zeros((2, 2, 1))).spread(of).covariance
     np.testing.assert_allclose(P[0, 0], [[5.0, -3.0], [-3.0, 2.0]], rtol=1e-12)
 
 
 def results(given):
-    A, B, _, G, _, _ = given
-    return solve_chains(*given), filtered_chains(A, B, G), *smoothed_chains(A, B, G)
+    A, B, _, G, a, _ = given
+    of = Tangents(A, B)
+    all_of = noise(G)
+    return states(*given), all_of.blind_variances(of), all_of.doubt(of, a), *all_of.spread(of)
 
 
 @pytest.mark.usefixtures("engine")
@@ -159,17 +166,3 @@ def test_a_trial_has_the_same_bits_alone_and_beside_one_that_is_not_finite():
         alone = results((A[some], B[some], D[some], G, a[some], v[some]))
         for one, whole in zip(alone, together, strict=True):
             np.testing.assert_array_equal(one, whole[some])
-
-
-@pytest.mark.parametrize("places", [(0, 1, 2, 3), (1, 2, 0, 3), (3, 0, 2, 1)])
-def test_a_triangular_root_keeps_the_digits_of_small_columns_beside_large_ones(places):
-    """Its determinant is that of W W', by all minors of W (Cauchy and Binet): reflections that meet
-    the small columns first lose seven digits of it."""
-    w = 2**30
-    W = np.array([[0, w, w, 0], [2, w, 0, 1], [1, 0, w, 1]])
-    minors = [-3 * w**2, -w, -w, -2 * w**2]
-    F = lower(np.stack([W[:, places], np.zeros_like(W)]).astype(float))
-    squared = float(sum(minor**2 for minor in minors))
-    np.testing.assert_allclose(np.prod(np.diagonal(F[0])), np.sqrt(squared), rtol=1e-14)
-    np.testing.assert_array_equal(np.triu(F[0], 1), 0.0)
-    np.testing.assert_array_equal(F[1], 0.0)
