@@ -337,6 +337,7 @@ def estimate(
     error_scale: float | None = None,
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ignore_columns: Sequence[str] = (),
+    examine: bool = True,
     progress: Shows = True,
 ) -> Answer: ...
 
@@ -352,6 +353,7 @@ def estimate(
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ignore_columns: Sequence[str] = (),
     find: str | Sequence[str] = (),
+    examine: bool = True,
     progress: Shows = True,
 ) -> Answer | LogAnswer:
     """Estimates parameters from real readings by every estimator, with standard errors, residuals
@@ -374,6 +376,9 @@ def estimate(
         ignore_columns: columns of the files that are left out.
         find: constants, noises or readings of a state model by formulas, found as `constants` by
             largest likelihood.
+        examine: whether further starts look for a lower minimum, and its intervals are computed;
+            without that one fit of few readings takes a few milliseconds, as loops over many data
+            sets need.
         progress: whether a terminal or a notebook shows what is at work; "lines" prints a line now
             and then elsewhere.
 
@@ -399,6 +404,7 @@ def estimate(
     from ipe_bench.real.estimation import Question
     from ipe_bench.report.page.answer import Answer
 
+    _refuse_table(readings)
     model = renewed(model)  # as in `_scenario`
     if isinstance(model, StateModel):
         stated = {
@@ -432,7 +438,7 @@ def estimate(
     question = Question(
         model=model, readings=_given(readings), estimators=estimators, **stated
     ).checked()
-    return Answer.to(question, progress=progress)
+    return Answer.to(question, progress=progress, examine=examine)
 
 
 def _tracked(
@@ -661,6 +667,15 @@ def _given(readings: Any) -> tuple[Path, ...] | Array | None:
     if all(isinstance(one, Path | str) for one in several):
         return tuple(map(Path, several))
     return np.asarray(several)
+
+
+def _refuse_table(readings: Any) -> None:
+    if isinstance(readings, Mapping) or hasattr(readings, "columns"):
+        names = ", ".join(map(str, getattr(readings, "columns", readings)))
+        raise UserError(
+            f"readings=: is a table of {names}; write it to a file with"
+            " frame.to_csv('my.csv', index=False), and give readings='my.csv'"
+        )
 
 
 def _require_whole(**numbers: Any) -> None:

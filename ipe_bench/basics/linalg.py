@@ -248,7 +248,7 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
         L = _of_each(np.linalg.cholesky, unit)
         U = L.swapaxes(1, 2)
         inverse_U = _inverse_of_upper(U)
-        condition = np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(n)
+        condition = np.sqrt(np.sum(inverse_U**2, axis=(1, 2))) * np.sqrt(n)
         well = usable & (condition <= _WELL_CONDITIONED)
         return U * size[:, None, :], inverse_U / size[:, :, None], well
 

@@ -151,9 +151,12 @@ def iterate(equations: E, method: Method[E, S], start: Array | S, limits: Limits
             (spent, Status.BUDGET),
             (iteration == limits.max_iterations, Status.MAX_ITERATIONS),
         )
-        holds, ending = zip(*endings, strict=True)
-        status[active] = np.select(holds, ending, Status.RUNNING)
-        going = status[active] == Status.RUNNING
+        now = np.full(len(active), Status.RUNNING, np.int8)
+        for holds, ending in reversed(endings):
+            if np.any(holds):
+                now = np.where(holds, ending, now)
+        status[active] = now
+        going = now == Status.RUNNING
         if going.all():
             continue
         if not going.any():

@@ -51,6 +51,8 @@ class EvaluationCount:
 
     def failed(self, rows: NDArray[np.intp]) -> Mask:
         """Tells which of the trials `rows` an exception has ended."""
+        if not self.messages:
+            return np.zeros(len(rows), dtype=bool)
         return np.isin(rows, list(self.messages))
 
 

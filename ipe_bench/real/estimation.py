@@ -139,11 +139,15 @@ class Question:
             raise UserError("; ".join(lacking))
         return self
 
-    def fitted(self, watch: Callable[[str], object] = str) -> tuple[list[Fit], Examination | None]:
+    def fitted(
+        self, watch: Callable[[str], object] = str, *, examine: bool = True
+    ) -> tuple[list[Fit], Examination | None]:
         """Fits every estimator, whose label `watch` is called with before, and examines the least
-        minimum."""
+        minimum, unless told not to."""
         noise = self.scenario.noise
         fits = fit(self.problem, self.found.z, self.estimators, noise, watch)
+        if not examine:
+            return fits, None
         return examined(self.problem, self.found.z, fits, noise)
 
     def _noise(self) -> Noise:

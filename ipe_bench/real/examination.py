@@ -40,7 +40,9 @@ _WORK = 20_000_000
 """The most entries of Jacobians in one iteration of all draws or starts: there are fewer of very
 many readings."""
 _FEWEST = 4
-"""The least number of draws or starts."""
+"""The least number of starts."""
+_FEWEST_DRAWS = 40
+"""Draws below which there is no bootstrap: ends of 95 % intervals are the outermost one."""
 _SAME = 1e-2
 """Minima closer than this, in standard errors of either, are one."""
 _LOWER = 1e-6
@@ -250,6 +252,9 @@ class Examination:
         the estimate, so that intervals are those of Student's t if the model is linear.
         """
         draws = self._affordable(self.bootstraps)
+        unknown = np.full(len(self.x), np.nan)
+        if draws < min(_FEWEST_DRAWS, self.bootstraps):
+            return BootstrapIntervals(unknown, unknown, 0, 0)
         z = self._present + self._drawn_noise(draws)
         free = self.released
         if free is None:
@@ -259,7 +264,6 @@ class Examination:
             values = np.delete(values, free.places, axis=1)
         values = values[answered]
         if len(values) < draws / 2:
-            unknown = np.full(len(self.x), np.nan)
             return BootstrapIntervals(unknown, unknown, len(values), draws)
         tail = (1 - CONFIDENCE) / 2
         low, high = self._without_levels(*np.quantile(values, [tail, 1 - tail], axis=0))

@@ -4,6 +4,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.stats import binom, chi2, kstest
 from shared.oracles import assert_agrees
@@ -159,3 +160,23 @@ def test_an_estimate_that_has_not_converged_does_not_pass_however_well_it_fits()
     hasty = LevenbergMarquardt(start="nominal", max_iterations=4, tolerance=1e-14)
     (found,) = ib.estimate(model, z, {"hasty": hasty}, noise=Gaussian(0.05)).fits
     assert (found.fits, found.passes) == (True, False)
+
+
+def test_a_fit_without_its_examination_is_the_same_fit():
+    model = Polynomial()
+    z = Scenario(model, Gaussian(0.01), error_scale=3.0).draw(0, 1).z[0]
+    lm = {"lm": LevenbergMarquardt()}
+    whole = ib.estimate(model, z, lm, noise=Gaussian(0.01))
+    alone = ib.estimate(model, z, lm, noise=Gaussian(0.01), examine=False)
+    assert whole.examination is not None
+    assert alone.examination is None
+    assert alone.passes
+    assert np.array_equal(alone["lm"].x, whole["lm"].x)
+    assert np.array_equal(alone["lm"].covariance, whole["lm"].covariance)
+
+
+@pytest.mark.parametrize("model", [Polynomial(), ConstantVelocity()])
+@pytest.mark.parametrize("table", [pd.DataFrame({"t": [1.0], "y": [2.0]}), {"t": [1.0], "y": [2]}])
+def test_a_table_in_memory_is_refused_with_a_way_out(model, table):
+    with pytest.raises(ib.UserError, match=r"is a table of t, y; write it to a file"):
+        ib.estimate(model, table)

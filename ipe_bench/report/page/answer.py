@@ -121,14 +121,16 @@ class Answer(Labelled[Fit]):
     """The columns of the files that were left out on purpose."""
 
     @classmethod
-    def to(cls, question: Question, name: str = "", progress: Shows = True) -> Answer:
-        """Returns the answer to a question, under its model's name or another `name`; `progress` is
-        that of `ipe_bench.estimate`."""
+    def to(
+        cls, question: Question, name: str = "", progress: Shows = True, *, examine: bool = True
+    ) -> Answer:
+        """Returns the answer to a question, under its model's name or another `name`; `progress`
+        and `examine` are those of `ipe_bench.estimate`."""
         from ipe_bench.report.progress import counting
 
         model = question.found.model
         with counting("estimate", len(question.estimators), progress) as begin:
-            fitted = question.fitted(begin)
+            fitted = question.fitted(begin, examine=examine)
         ignored = ", ".join(question.ignored)
         return cls(name or model.name, model, question.found.z, *fitted, ignored)
 
@@ -376,11 +378,9 @@ def _together(values: Sequence[float], between: str, place: int) -> str:
     power = math.floor(math.log10(largest or 10.0**place))
     if power - place > _MOST_FIGURES:
         return between.join(f"{v:.4g}" for v in values)
-    if (
-        largest >= 1e-4
-        and place >= -6
-        and (largest < 1e6 or place <= 0 or power - place > _FEW_FIGURES)
-    ):
+    small = place < (-6 if power < 0 else -_MOST_FIGURES)
+    large = largest >= 1e6 and place > 0 and power - place <= _FEW_FIGURES
+    if largest >= 1e-4 and not small and not large:
         # Zero has no sign.
         rounded = (round(v, -place) + 0.0 for v in values)
         return between.join(f"{v:.{max(-place, 0)}f}" for v in rounded)
@@ -660,6 +660,8 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
             )
     drawn = found.bootstrap.drawn
     lost = drawn - found.bootstrap.converged
+    if not drawn:
+        yield "Bootstrap: not computed, because there are too many readings."
     if lost > 0:
         yield f"Bootstrap: {lost} of {drawn} simulated data sets gave no estimate."
 

@@ -431,7 +431,10 @@ def csv_text(data: pd.DataFrame) -> str:
     safe = data.rename(columns=_no_formula)
     for place, kind in enumerate(data.dtypes):
         if not is_numeric_dtype(kind):
-            safe.isetitem(place, [_no_formula(cell) for cell in data.iloc[:, place]])
+            column = data.iloc[:, place]
+            # Of many rows each different text is looked at once.
+            shown = {cell: _no_formula(cell) for cell in column.unique()}
+            safe.isetitem(place, [shown.get(cell, cell) for cell in column])
     return safe.to_csv(index=False)
 
 
