@@ -22,6 +22,8 @@ def take(batch: B, kept: NDArray[Any]) -> B:
         return [batch[i] for i in _indices(kept)]  # pyright: ignore[reportReturnType]
     if is_dataclass(batch):
         return _each(lambda part: take(part, kept), batch)
+    if isinstance(batch, tuple):
+        return type(batch)(*[take(part, kept) for part in batch])
     return batch[kept]  # type: ignore[index]
 
 

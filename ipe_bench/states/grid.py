@@ -8,28 +8,38 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.batches import gather, take
+from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Count
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.particles import weighed
 from ipe_bench.states.trackers import Tracker, Tracks
 
-_PATHS = 1000
+_PATHS = 200
 """Drawn paths by which the grid of an epoch is as wide as the states are."""
-_BEYOND = 3.0
-"""Their standard deviations by which it is wider on either side."""
+_BEYOND = 4.0
+"""Their standard deviations by which it is wider on either side at first."""
 _COARSE = 1.6
 """Largest squared step of the points in standard deviations of process noise, and of the density
 about its peak: an integral is then wrong by a share of exp(-2 pi^2 / 1.6) = 4e-6."""
-_AT_ONCE = 25
+_AT_ONCE = 50
 """Trials that are smoothed at once."""
 _CUT = 1e-6
 """Largest density at an end of the grid, in parts of the peak."""
 _TINY = 1e-300
 """What a density is divided by at least."""
-_MOST_POINTS = 10_000
-"""Points of an epoch beyond which none are asked for: their kernel takes 0.8 GB."""
+_MOST_POINTS = 5_000
+"""Points of an epoch beyond which none are asked for: their kernel takes 0.2 GB."""
+
+
+class _Extent(NamedTuple):
+    """Says where the points of an epoch lie."""
+
+    points: int
+    beyond: float
+    """Standard deviations of drawn states by which they lie beyond these on either side."""
 
 
 @dataclass(frozen=True)
@@ -53,80 +63,180 @@ class Grid(Tracker):
     """Whether each epoch is estimated from all readings instead of those up to it."""
 
     def hindrance(self, model: StateModel) -> str | None:
+        if self.points < 3:
+            return "needs three points at least; leave trackers.LABEL.points out"
+        fitting = self.fitting(model)
+        if isinstance(fitting, str):
+            return fitting
+        if fitting.points == self.points:
+            return None
+        return (
+            "its points are farther apart than the noise of states or readings reaches; "
+            f"set trackers.LABEL.points={fitting.points}"
+        )
+
+    def fitting(self, model: StateModel) -> Grid | str:
+        """Returns the grid of as many points as the model needs, these at least, or why none is
+        exact for it, in words that follow the tracker's label."""
         if model.n > 1:
             return f"is exact for one state, and {model.name} has {model.n}; leave it out"
         if model.state_periods:
             return f"has no place for a periodic state, as in {model.name}; leave it out"
-        if self.points < 3:
-            return "needs three points at least; leave trackers.LABEL.points out"
-        grids = self._grids(model)
-        epochs = [k for k in range(model.epochs) if model.moves(k)]
-        # The widest step that process noise still bridges, of each epoch.
-        allowed = np.sqrt([_COARSE * _variances(model, grids, k).min() for k in epochs])
-        if not (allowed > 0).all():
+        drawn = _drawn(model)
+        grids = _grids(drawn, _Extent(self.points, _BEYOND))
+        # The least process noise of each epoch has to bridge steps.
+        noise = [_variances(model, grids, k).min() for k in range(model.epochs) if model.moves(k)]
+        if not (np.array(noise) > 0).all():
             return f"needs process noise at every step of {model.name}; leave it out"
-        steps = [_widest_step(model, grids, k) for k in epochs]
-        excess = np.max(steps / allowed, initial=0.0)
+        widest = max(_squared_step(model, grids, drawn, k) for k in range(model.epochs))
+        excess = math.sqrt(widest / _COARSE)
         if not excess > 1:
-            return None
-        least = 1.1 * self.points * excess
-        if least > _MOST_POINTS:
+            return self
+        needed = 1.02 * self.points * excess
+        if needed > _MOST_POINTS:
             return (
-                f"would need {least:.2g} points for the process noise of {model.name}, above"
+                f"would need {needed:.2g} points for the noise of {model.name}, above"
                 f" {_MOST_POINTS}; leave it out"
             )
-        needed = math.ceil(least)
         # The moves of so coarse a grid hardly tell how fine it has to be: the finer one is asked.
-        finer = replace(self, points=needed).hindrance(model)
-        if finer:
-            return finer
-        return (
-            "its points are farther apart than process noise reaches; "
-            f"set trackers.LABEL.points={needed}"
-        )
+        return replace(self, points=math.ceil(needed)).fitting(model)
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         # A smoother keeps the densities of all epochs.
         if self.smooths and len(z) > _AT_ONCE:
             parts = np.split(z, range(_AT_ONCE, len(z), _AT_ONCE))
             return Tracks.join([self.track(model, part) for part in parts])
-        out = Tracks.empty(model, len(z))
-        grids = self._grids(model)
-        out.calls += (self.points + _PATHS) * model.evaluations
-        filtered = self._filtered(model, grids, z, out)
-        if self.smooths:
-            # The way back moves the points once more.
-            out.calls += self.points * (model.epochs - 1)
-            _smooth(model, grids, filtered, out)
-        return out
+        return self._tracked(model, z, _Extent(self.points, _BEYOND))
 
-    def _filtered(self, model: StateModel, grids: Array, z: Array, out: Tracks) -> list[_Densities]:
-        """Runs the filter forward; the densities of each epoch are for a smoother alone."""
+    def _tracked(self, model: StateModel, z: Array, extent: _Extent) -> Tracks:
+        """Tracks each trial by points of an extent, or by more where its density asks for them."""
+        tracks, faults = self._by(_Steps.of(model, extent), z)
+        paid = extent.points * model.evaluations
+        finer = extent._replace(points=2 * extent.points)
+        wider = finer._replace(beyond=2 * extent.beyond)
+        parts = [(np.arange(len(z)), tracks)]
+        for bad, more in ((faults.coarse, finer), (faults.beyond, wider)):
+            rows = np.flatnonzero(bad)
+            if not rows.size:
+                continue
+            if more.points > _MOST_POINTS:
+                raise ArithmeticError(faults.text(rows[0]))
+            again = self._tracked(model, z[rows], more)
+            again.calls += paid
+            parts.append((rows, again))
+        good = np.flatnonzero(~(faults.coarse | faults.beyond))
+        parts[0] = good, take(tracks, good)
+        return gather(parts)
+
+    def _by(self, steps: _Steps, z: Array) -> tuple[Tracks, _Faults]:
+        """Runs the filter forward, and the smoother back; tells which trials these points do not
+        suit."""
+        model = steps.model
+        out = Tracks.empty(model, len(z))
+        out.calls += (steps.grids.shape[1] + _PATHS) * model.evaluations
+        faults = _Faults.none(len(z))
         m, P = model.prior
         # A start that is known exactly has a grid of one and the same point.
-        start = np.exp(-0.5 * (grids[0] - m) ** 2 / (P[0, 0] or 1.0))
+        start = np.exp(-0.5 * (steps.grids[0] - m) ** 2 / (P[0, 0] or 1.0))
         p = np.repeat(start[None] / start.sum(), len(z), axis=0)
         kept: list[_Densities] = []
         for k in range(model.epochs):
             # Prediction: p(x_k | z_1..k-1) = integral of p(x_k | x) p(x | z_1..k-1) dx
             if model.moves(k):
-                p = _normalised(multiply(_kernel(model, grids, k), p))
+                p = _normalised(multiply(steps.kernel(k), p))
             predicted = p
             # Update: p(x_k | z_1..k) ~ p(z_k | x_k) p(x_k | z_1..k-1)
-            x = np.repeat(grids[k + 1][None, :, None], len(z), axis=0)
+            x = np.repeat(steps.grids[k + 1][None, :, None], len(z), axis=0)
             p = weighed(model, x, k, z[:, k], predicted, out)
-            _require_resolved(p, k)
-            _describe(out, k, p, grids)
+            faults.note(p, k)
+            _describe(out, k, p, steps.grids)
             if self.smooths:
                 kept.append(_Densities(predicted, p))
-        return kept
+        if self.smooths:
+            _smooth(steps, kept, out)
+        return out, faults
 
-    def _grids(self, model: StateModel) -> Array:
-        """Returns the points (K + 1, points) before the first transition, and at each epoch."""
-        paths = StateModel.draw(model, 0, _PATHS)
-        x = np.concatenate([paths.start, paths.x[..., 0]], axis=1)
-        margin = _BEYOND * x.std(axis=0)
-        return np.linspace(x.min(axis=0) - margin, x.max(axis=0) + margin, self.points, axis=1)
+
+@dataclass
+class _Faults:
+    """Holds which trials the points of a grid do not suit."""
+
+    coarse: Mask
+    """Whose density falls between the points (trials,)."""
+    beyond: Mask
+    """Whose density runs over an end (trials,)."""
+    epoch: NDArray[np.int64]
+    """The first such epoch k (trials,)."""
+
+    @classmethod
+    def none(cls, trials: int) -> _Faults:
+        nothing = np.zeros(trials, dtype=bool)
+        return cls(nothing, nothing.copy(), np.zeros(trials, np.int64))
+
+    def note(self, p: Array, k: int) -> None:
+        """Notes what is wrong with the densities p (trials, points) of epoch k, which become even
+        ones: what follows of such a trial says nothing, and has to go on."""
+        rows = np.arange(len(p))
+        at = p.argmax(axis=1).clip(1, p.shape[1] - 2)
+        peak = p[rows, at]
+        # The second difference of -log p: squared steps in standard deviations about the peak.
+        beside = p[rows, at - 1] * p[rows, at + 1]
+        bend = np.log(np.maximum(peak**2, _TINY) / np.maximum(beside, _TINY))
+        noted = self.coarse | self.beyond
+        coarse = ~noted & ~(bend < _COARSE)
+        beyond = ~noted & ~coarse & ~(np.maximum(p[:, 0], p[:, -1]) < _CUT * peak)
+        self.coarse |= coarse
+        self.beyond |= beyond
+        self.epoch[coarse | beyond] = k
+        p[self.coarse | self.beyond] = 1 / p.shape[1]
+
+    def text(self, trial: int) -> str:
+        """Says what is wrong with a trial."""
+        density = f"the density of epoch {self.epoch[trial] + 1}"
+        if self.coarse[trial]:
+            return f"{density} falls between the points of the grid, {_MOST_POINTS} at most"
+        return f"{density} runs over an end of the grid: the model draws no such path"
+
+
+def _drawn(model: StateModel) -> Array:
+    """Draws states (paths, K + 1) before the first transition, and at each epoch."""
+    paths = StateModel.draw(model, 0, _PATHS)
+    return np.concatenate([paths.start, paths.x[..., 0]], axis=1)
+
+
+def _grids(drawn: Array, extent: _Extent) -> Array:
+    """Returns the points (K + 1, points) before the first transition, and at each epoch, as far as
+    drawn states (paths, K + 1) are."""
+    margin = extent.beyond * drawn.std(axis=0)
+    least = drawn.min(axis=0) - margin
+    return np.linspace(least, drawn.max(axis=0) + margin, extent.points, axis=1)
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """Holds how probability moves from the points of one epoch to those of the next."""
+
+    model: StateModel
+    grids: Array
+    """Points (K + 1, points) before the first transition, and at each epoch."""
+    moved: list[Array | None]
+    """The points (points,) before each epoch, moved to it without process noise; None where no
+    transition leads into it."""
+
+    @classmethod
+    def of(cls, model: StateModel, extent: _Extent) -> _Steps:
+        grids = _grids(_drawn(model), extent)
+        moved = [_moved(model, grids, k) if model.moves(k) else None for k in range(model.epochs)]
+        return cls(model, grids, moved)
+
+    def kernel(self, k: int) -> Array:
+        """Computes the probability (points, points) of each point of epoch k, up to a factor, from
+        each of the epoch before."""
+        Q = _variances(self.model, self.grids, k)
+        # N(x_k; f(x), Q(x)); what all columns share drops out of the sums.
+        d = self.grids[k + 1][:, None] - self.moved[k]
+        p = np.exp(-0.5 * d**2 / Q)
+        return p / np.sqrt(Q) if self.model.gain_by_state else p
 
 
 class _Densities(NamedTuple):
@@ -138,32 +248,22 @@ class _Densities(NamedTuple):
     """Probabilities (trials, points) after them."""
 
 
-def _smooth(model: StateModel, grids: Array, kept: list[_Densities], out: Tracks) -> None:
+def _smooth(steps: _Steps, kept: list[_Densities], out: Tracks) -> None:
     """Passes back from the last epoch (Kitagawa, 1987):
 
     p(x_k | z) = p(x_k | z_1..k) integral of p(x_k+1 | x_k) p(x_k+1 | z) / p(x_k+1 | z_1..k) dx_k+1
     """
     p = kept[-1].filtered
-    for k in range(model.epochs - 2, -1, -1):
+    for k in range(len(kept) - 2, -1, -1):
         predicted = kept[k + 1].predicted
         # Points that were impossible stay so.
         ratio = np.where(predicted > 0, p / np.maximum(predicted, _TINY), 0.0)
-        p = _normalised(kept[k].filtered * multiply(_kernel(model, grids, k + 1).T, ratio))
-        _describe(out, k, p, grids)
+        p = _normalised(kept[k].filtered * multiply(steps.kernel(k + 1).T, ratio))
+        _describe(out, k, p, steps.grids)
 
 
 def _normalised(p: Array) -> Array:
     return p / p.sum(axis=1, keepdims=True)
-
-
-def _kernel(model: StateModel, grids: Array, k: int) -> Array:
-    """Computes the probability (points, points) of each point of epoch k, up to a factor, from each
-    of the epoch before."""
-    Q = _variances(model, grids, k)
-    # N(x_k; f(x), Q(x)); what all columns share drops out of the sums.
-    d = grids[k + 1][:, None] - _moved(model, grids, k)
-    p = np.exp(-0.5 * d**2 / Q)
-    return p / np.sqrt(Q) if model.gain_by_state else p
 
 
 def _variances(model: StateModel, grids: Array, k: int) -> Array:
@@ -177,11 +277,24 @@ def _moved(model: StateModel, grids: Array, k: int) -> Array:
     return model.transition_into(k)(grids[k][:, None])[:, 0]
 
 
-def _widest_step(model: StateModel, grids: Array, k: int) -> float:
-    """Returns the widest step between points of epoch k, and between those before it once moved."""
-    own = np.diff(grids[k + 1])
-    moved = np.diff(_moved(model, grids, k))
-    return max(own.max(), np.abs(moved).max())
+def _squared_step(model: StateModel, grids: Array, drawn: Array, k: int) -> float:
+    """Returns the widest squared step between points of epoch k, in deviations of a density there
+    by process noise and readings, or between those before it once moved, by process noise alone;
+    readings count where paths were drawn (paths, K + 1)."""
+    points = grids[k + 1]
+    own = (points[1] - points[0]) ** 2
+    by_noise = moved = 0.0
+    if model.moves(k):
+        Q = _variances(model, grids, k).min()
+        by_noise = own / Q
+        moved = np.max(np.diff(_moved(model, grids, k)) ** 2) / Q
+    x = drawn[:, k + 1, None]
+    two = np.stack([x, x + points[1] - points[0]], axis=1)
+    h = model.observation_at(k)(two)
+    apart = model.nearest(h[:, 1], h[:, 0]) - h[:, 0]
+    R = model.R_at(two[:, 0], k)
+    by_readings = np.sum(apart * np.linalg.solve(R, apart[..., None])[..., 0], axis=1)
+    return max(moved, by_noise + by_readings.max())
 
 
 def _describe(out: Tracks, k: int, p: Array, grids: Array) -> None:
@@ -190,23 +303,3 @@ def _describe(out: Tracks, k: int, p: Array, grids: Array) -> None:
     mean = np.sum(p * x, axis=1)
     out.mean[:, k, 0] = mean
     out.covariance[:, k, 0, 0] = np.sum(p * (x - mean[:, None]) ** 2, axis=1)
-
-
-def _require_resolved(p: Array, k: int) -> None:
-    """Refuses densities p (trials, points) that fall between points, or run over an end."""
-    rows = np.arange(len(p))
-    at = p.argmax(axis=1).clip(1, p.shape[1] - 2)
-    peak = p[rows, at]
-    # The second difference of -log p: squared steps in standard deviations about the peak.
-    beside = p[rows, at - 1] * p[rows, at + 1]
-    bend = np.log(peak**2 / np.maximum(beside, _TINY))
-    if not (bend < _COARSE).all():
-        raise ArithmeticError(
-            f"the density of epoch {k + 1} falls between the points of the grid; set more points"
-        )
-    ends = np.maximum(p[:, 0], p[:, -1]) / peak
-    if not (ends < _CUT).all():
-        raise ArithmeticError(
-            f"the density of epoch {k + 1} runs over an end of the grid: "
-            "the model draws no such path"
-        )

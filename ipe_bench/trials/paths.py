@@ -346,7 +346,7 @@ class PathBlock:
             known |= ~np.isnan(p)
             is_open |= p < SURE
         if tracks.other_p is not None:
-            known |= np.isfinite(tracks.mean).all(axis=(1, 2))
+            known |= np.isfinite(tracks.mean).all(axis=(1, 2)) & np.isfinite(tracks.other_p)
             is_open |= tracks.other_p > 1 - SURE
         if known.any():
             columns["extra_ambiguous"] = np.where(known, is_open, np.nan)

@@ -8,28 +8,51 @@ import numpy as np
 import pytest
 from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth
 
+import ipe_bench as ib
 from ipe_bench.states import (
     AutoTracker,
+    Bootstrap,
     Formulas,
+    Grid,
     LevenbergMarquardtSmoother,
     Smoother,
     ekf,
     ukf,
 )
-from ipe_bench.states.auto import AGAIN, DAMPED, EXTENDED, MIRRORED, UNSCENTED
+from ipe_bench.states.auto import AGAIN, DAMPED, EXACT, EXTENDED, MIRRORED, UNSCENTED
 from ipe_bench.states.whole_paths import PathDensity
 from ipe_bench.trials.paths import PathBlock, StateScenario
 
-LOST = Growth(count=30)
-"""Whose readings leave the sign of the state open, so that paths are lost."""
+LOST = Formulas(
+    next={"x": "x/2 + 25*x/(1 + x**2) + 8*cos(1.2*k) + w", "offset": "offset"},
+    readings={"z": "x**2/20 + offset"},
+    noise={"w": 3.2},
+    deviation={"z": 1.0},
+    spread={"x": 1.4, "offset": 0.1},
+    count=30,
+)
+"""Growth with a second state: readings leave the sign of the first one open, so that paths are
+lost."""
 BY_STATE = Formulas(
-    next={"x": "0.9*x + w"},
-    readings={"z": "x"},
+    next={"x": "0.9*x + w", "offset": "offset"},
+    readings={"z": "x + offset"},
     noise={"w": 0.3},
     deviation={"z": "0.1 + 0.5*abs(x)"},
-    spread={"x": 1.0},
+    spread={"x": 1.0, "offset": 0.1},
     count=20,
 )
+SQUARE = Formulas(
+    next={"x": "0.95*x + w"},
+    readings={"z": "x**2"},
+    noise={"w": 0.3},
+    deviation={"z": 0.3},
+    start={"x": 0.5},
+    spread={"x": 1.0},
+    count=12,
+)
+NOISY = replace(SQUARE, readings={"z": "x"}, deviation={"z": "sqrt(0.01 + x**2/4)"})
+VOLATILITY = replace(SQUARE, readings={"z": "0"}, deviation={"z": "exp(x/2)"})
+"""Whose readings tell of the state by their size alone."""
 
 
 def test_a_linear_model_is_answered_by_its_first_stage():
@@ -82,6 +105,57 @@ def test_each_stage_answers_where_those_before_it_do_not():
         np.testing.assert_array_equal(after.mean[same], before.mean[same])
 
 
+@pytest.mark.parametrize(
+    "model", [SQUARE, NOISY, VOLATILITY], ids=["square", "noise by state", "volatility"]
+)
+def test_a_folded_reading_of_a_scalar_state_has_the_exact_density(model):
+    """As that of a grid of more points, a missing reading included; no other tracker looks."""
+    z = model.draw(0, 3).z
+    z[1, 4] = np.nan
+    tracker = AutoTracker()
+    assert tracker.hindrance(model) is None
+    found = tracker.track(model, z)
+    exact = Grid(700, smooths=True).track(model, z)
+    np.testing.assert_array_equal(found.stage, EXACT)
+    np.testing.assert_allclose(found.mean, exact.mean, atol=1e-4)
+    np.testing.assert_allclose(found.covariance, exact.covariance, atol=1e-4)
+
+
+def test_a_scalar_state_whose_readings_rise_evenly_needs_no_grid():
+    for readings in ("x", "x + 0.1*x**2", "exp(x/3)", "(x + 20)**2/10"):
+        model = replace(SQUARE, readings={"z": readings}, spread={"x": 0.5})
+        assert (AutoTracker().track(model, model.draw(0, 20).z).stage != EXACT).all()
+
+
+def test_a_trial_that_no_grid_suits_is_tracked_by_paths_and_disturbs_no_other():
+    z = SQUARE.draw(0, 3).z
+    plain = AutoTracker().track(SQUARE, z)
+    z[1, 5] = 1e6  # a state of 1,000
+    found = AutoTracker().track(SQUARE, z)
+    np.testing.assert_array_equal(found.stage == EXACT, [True, False, True])
+    np.testing.assert_array_equal(found.mean[::2], plain.mean[::2])
+    assert np.isfinite(found.cost).all()
+
+
+def test_the_exact_density_leaves_no_second_path_open():
+    block = PathBlock.draw(StateScenario(SQUARE), 0, 4)
+    columns = block.estimate(AutoTracker())[1]
+    assert (columns["extra_stage"] == EXACT).all()
+    assert (columns["status"] == "converged").all()
+    assert "extra_ambiguous" not in columns
+
+
+@pytest.mark.slow
+def test_on_growth_the_answer_is_that_of_the_grid_at_less_than_the_price_of_particles():
+    table = ib.run(
+        Growth(), {"auto": AutoTracker(), "grid": Grid(), "bootstrap": Bootstrap()}, trials=60
+    )
+    rows = table[table["parameter"] == "all"].set_index("estimator")
+    assert rows.loc["auto", "success"] == rows.loc["grid", "success"]
+    assert rows.loc["auto", "rmse_solved"] == pytest.approx(rows.loc["grid", "rmse_solved"], 1e-3)
+    assert rows.loc["auto", "simulations_median"] <= 1.2 * rows.loc["bootstrap", "simulations_median"]
+
+
 def test_a_round_has_draws_of_its_own():
     density = PathDensity.of(LOST, LOST.draw(0, 3).z)
     begun = LevenbergMarquardtSmoother(starts=1)
@@ -109,7 +183,9 @@ def test_noise_that_depends_on_the_states_is_left_to_the_likelier_smoother():
 
 
 @pytest.mark.parametrize(
-    "model", [LOST, replace(CoordinatedTurn(), count=20)], ids=["lost", "turn"]
+    "model",
+    [LOST, SQUARE, replace(CoordinatedTurn(), count=20)],
+    ids=["lost", "square", "turn"],
 )
 def test_a_trial_has_the_same_bits_alone_and_in_a_batch(model):
     z = model.draw(0, 5).z

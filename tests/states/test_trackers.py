@@ -410,26 +410,43 @@ def test_particles_have_the_likelihood_of_the_kalman_filter_of_a_linear_model():
     assert 1 < particles.effective.min() < particles.effective.max() < 2000
 
 
-def test_a_grid_refuses_what_it_cannot_be_exact_for():
-    growth = Growth(count=20)
+def test_a_grid_refuses_what_it_cannot_be_exact_for(monkeypatch):
+    growth = Growth(count=8)
     assert "is exact for one state, and pendulum has 2" in Grid().hindrance(NEAR)
     for points in (1, 2):
         assert "needs three points at least" in Grid(points).hindrance(growth)
     with pytest.raises(
         ib.UserError,
-        match=r"trackers\.grid: its points are farther apart than process noise reaches",
+        match=r"trackers\.grid: its points are farther apart than the noise of states or readings",
     ) as refused:
         ib.run(growth, {"grid": Grid(300)}, 3)
     needed = int(str(refused.value).rpartition("=")[2])
     assert Grid(needed).hindrance(growth) is None
     z = growth.draw(0, 3).z
-    z[1, 7] = 400.0  # a state of 90, as none is
     table = ib.run(growth, {"grid": Grid(needed)}, 3)
     assert (table["converged"] == 1).all()
-    with pytest.raises(ArithmeticError, match="runs over an end of the grid"):
-        Grid(needed).track(growth, z)
+    sharp = Sharp()
+    assert "points for the noise of sharp, above 5000; leave it out" in Grid(400).hindrance(sharp)
+    monkeypatch.setattr("ipe_bench.states.grid._MOST_POINTS", 1000)
+    z[1, 7] = 400.0  # a state of 90, as none is
+    with pytest.raises(ArithmeticError, match="of epoch 8 runs over an end of the grid"):
+        Grid(900).track(growth, z[1:2])
     with pytest.raises(ArithmeticError, match="falls between the points of the grid"):
-        Grid(400).track(Sharp(), Sharp().draw(0, 3).z)
+        Grid(900).track(sharp, sharp.draw(0, 1).z)
+
+
+def test_a_trial_has_as_many_points_of_a_grid_as_its_density_asks_for():
+    """A state of 90 lies beyond what is drawn: its grid is wider, and costs more."""
+    growth = Growth(count=12)
+    z = growth.draw(0, 2).z
+    plain = Grid(900).track(growth, z)
+    z[1, 7] = 400.0
+    found = Grid(900).track(growth, z)
+    np.testing.assert_array_equal(found.mean[0], plain.mean[0])
+    # (x / 10) dx = 1 at x = sqrt(20 z)
+    assert abs(found.mean[1, 7, 0]) == pytest.approx(np.sqrt(8000), abs=0.5)
+    assert found.covariance[1, 7, 0, 0] == pytest.approx(100 / 8000, rel=0.1)
+    assert found.calls[0] == plain.calls[0] < found.calls[1]
 
 
 def test_a_grid_is_refused_where_no_number_of_points_would_do():
@@ -444,7 +461,7 @@ def test_a_grid_is_refused_where_no_number_of_points_would_do():
         count=6,
     )
     assert re.fullmatch(
-        r"would need \S+ points for the process noise of \S+, above 10000; leave it out",
+        r"would need \S+ points for the noise of \S+, above 5000; leave it out",
         Grid(50).hindrance(of_pole),
     )
 
