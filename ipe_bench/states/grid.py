@@ -50,7 +50,7 @@ class Grid(Tracker):
 
     >>> import ipe_bench as ib
     >>> model = ib.component("state_model/growth", count=8)
-    >>> trackers = {"ekf": ib.states.ekf(), "grid": ib.states.Grid(points=800)}
+    >>> trackers = {"ekf": ib.states.ekf(), "grid": ib.states.Grid()}
     >>> table = ib.run(model, trackers, trials=20)
     >>> rmse = table[table["parameter"] == "all"].set_index("estimator")["rmse_solved"]
     >>> bool(rmse["grid"] < rmse["ekf"])
