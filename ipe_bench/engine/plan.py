@@ -1,5 +1,11 @@
 """Plans what an integrator of recorded equations computes: formulas, programs, and where their
-numbers lie."""
+numbers lie.
+
+`Recording` calls the functions of a model once, and holds what they do as expressions. `_Linear`
+takes their tangents apart: what changes at each stage, and what is computed once a lane. `planned`
+gives each number a place in a frame, the memory of one lane, and returns a `StepPlan`: the programs
+of a step, which the integrator runs in every lane.
+"""
 
 from __future__ import annotations
 

@@ -141,8 +141,15 @@ _HALVINGS = ((5, 5), (15, 2), (_SHORT, 1))
 
 @dataclass(frozen=True)
 class Stages(Attempts):
-    """Begins from the start under two metrics; from the two best points on the ray through
-    the start; then from the best of 20 random points, again and again."""
+    """Attempts fits on all data from other starts, for models without epochs.
+
+    | attempt | begins from |
+    |---|---|
+    | 0, 1 | the start, in the metric of the sizes, then in Marquardt's |
+    | 2, 3 | the best point on the ray through the start, and the best unlike it |
+    | 4, 5, 7 to 12 | the best of 20 random points |
+    | 6, 13 to 15 | 20 random points of any size, of which a few steps choose |
+    """
 
     planned = 16
     repeats = 3
@@ -257,9 +264,14 @@ later."""
 
 @dataclass(frozen=True)
 class Windows(Attempts):
-    """Follows growing windows of data: from the start, then carefully from there, then from
-    16, 32, ... 256 draws of the prior; among them, where a prior is known after the first draws,
-    Levenberg-Marquardt on all data.
+    """Attempts fits that follow growing windows of data, for models with epochs.
+
+    | attempt without, with a prior | begins from |
+    |---|---|
+    | 0; 0 | the start |
+    | 1; 1 | the start, carefully: by more windows and more steps |
+    | 2, 3; 3, 4 | the start, on all data, as attempts 0 and 1 of `Stages` |
+    | 4 to 8; 2, 5 to 8 | 16, 32, ... 256 draws of the prior, or as far as the best fit lies |
 
     In the first two windows, whose fits have several minima of one depth, each candidate's prior is
     centred at its own draw: the randomised maximum likelihood of Oliver, He and Reynolds (5th
