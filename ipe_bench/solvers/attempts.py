@@ -375,8 +375,7 @@ class Windows(Attempts):
             spread = np.maximum(1.0, finite_or(1.0, distance))
         draws = np.zeros((1, n))
         if k > 1:
-            rng = generator(k)
-            draws = rng.standard_normal((_draws(k), n))
+            draws = generator(k).standard_normal((_draws(k), n))
         of_each = np.broadcast_to(spread, (len(rows), n))[:, None]
         return (x0 + of_each * draws).reshape(-1, n)
 
