@@ -454,7 +454,7 @@ def _tracked(
     from ipe_bench.report.page.log import LogAnswer
 
     if trackers is None:
-        choice = standard.THAT_FIND if find else {"tracker": standard.of_run("tracker")}
+        choice = standard.OF_FILTERS if find else {"tracker": standard.of_run("tracker")}
         trackers = standard.constructed(choice)
     question = LogQuestion.of(model, readings, _labelled(trackers), ignored, find)
     return LogAnswer.to(question, progress)

@@ -32,6 +32,7 @@ Finite = Annotated[float, FINITE]
 Positive = Annotated[float, Gt(0), FINITE]
 NonNegative = Annotated[float, Ge(0), FINITE]
 Share = Annotated[float, Ge(0), Le(1)]
+Quantile = Annotated[float, Gt(0), Le(1)]
 Count = Annotated[int, Gt(0)]
 Whole = Annotated[int, Ge(0)]
 

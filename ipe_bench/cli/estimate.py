@@ -50,8 +50,8 @@ def estimate_command(arguments: Sequence[str]) -> int:
 
 def standard_words(arguments: Sequence[str]) -> list[str]:
     """Returns the words that choose estimators and trackers where no argument does."""
-    finding = any(word.startswith("find=") for word in arguments)
-    choice = standard.OF_ESTIMATE | (standard.THAT_FIND if finding else {})
+    of_filters = any(word.startswith(("find=", "gate=")) for word in arguments)
+    choice = standard.OF_ESTIMATE | (standard.OF_FILTERS if of_filters else {})
     return [f"{group}=[{','.join(names)}]" for group, names in choice.items()]
 
 
@@ -63,15 +63,17 @@ def _track(asked: Single, model: StateModel) -> int:
     spec = asked.spec
     find = spec.find or ()
     question = asked.log_question(spec.readings, find)
-    command = {
+    command: dict[str, Any] = {
         "readings": spec.readings,
         "find": find,
         "model": describe(model),
         "trackers": asked.estimators,
     }
+    if spec.gate is not None:
+        command["gate"] = spec.gate
     log = question.log
     files = [log.file] if log.file else []
-    provenance = _provenance(asked, files, [log.model, *spec.estimators.values()])
+    provenance = _provenance(asked, files, [log.model, *question.trackers.values()])
     drawn = spec.figures != "none"
     with asked.folder(NAME, command, [TABLE]) as folder:
         answer = LogAnswer.to(question, "lines")

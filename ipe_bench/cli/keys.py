@@ -100,9 +100,14 @@ _ROWS = (
         " nothing",
     ),
     ("run", "write_readings_trial=N", ""),
-    ("files", "readings=FILE", "readings of `ipe-bench estimate`, with ignore_columns= and find="),
+    (
+        "files",
+        "readings=FILE",
+        "readings of `ipe-bench estimate`, with ignore_columns=, find= and gate=",
+    ),
     ("files", "ignore_columns=[A]", ""),
     ("files", "find=[A,B]", ""),
+    ("files", "gate=P", ""),
     (
         "",
         "+experiment=NAME",

@@ -28,7 +28,7 @@ sets."""
 _FEWEST = 20
 """Fewest of either that say anything of shares."""
 _REFUSED = "has no meaning with a model and readings of your own"
-_WITHOUT_MEANING = (*of("run", "figures"), TRUTH, "find", "experiment")
+_WITHOUT_MEANING = (*of("run", "figures"), TRUTH, "find", "gate", "experiment")
 
 
 def own_command(short: Short) -> int:

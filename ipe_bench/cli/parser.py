@@ -143,6 +143,8 @@ noise=unknown       estimate the noise level; the size of residuals is then
 ignore_columns=[A]  columns to leave out.
 find=[A,B]          find constants, noises or readings of state_model= by
                     maximum likelihood.
+gate=P              leave a reading out of a log whose innovation lies beyond
+                    this quantile of the predicted distribution, as in 0.999.
 parameters.NAME.fixed=X, .lower=X, .upper=X
                     knowledge of a parameter; parameters=FILE.yaml: of many.
 error_scale=X       distance of parameters from the start: the prior

@@ -60,7 +60,8 @@ class Single:
         self.words.refuse(
             ("error_scale",), "is of simulated trials; give the state model another prior"
         )
-        return LogQuestion.of(spec.state_model, readings, spec.estimators, spec.ignored, find)
+        asked = (spec.estimators, spec.ignored, find, spec.gate)
+        return LogQuestion.of(spec.state_model, readings, *asked)
 
     def folder(
         self, name: str, identity: Any, files: Sequence[str] = ()
@@ -118,7 +119,7 @@ def require_one_kind(words: Words, spec: Spec) -> None:
     """Refuses a tracker without a state model, and a state model together with a key of
     measurements, typed or from an experiment."""
     if spec.state_model is None:
-        words.refuse((*OF_STATES[1:], "find"), "goes with state_model=NAME")
+        words.refuse((*OF_STATES[1:], "find", "gate"), "goes with state_model=NAME")
         return
     why = "is of a measurement, and state_model= chooses states that move"
     words.refuse(OF_CONSTANTS, why)

@@ -12,7 +12,7 @@ import cloudpickle
 
 from ipe_bench.basics.definitions import pinned
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
-from ipe_bench.basics.options import Component, Count, Positive, Whole
+from ipe_bench.basics.options import Component, Count, Positive, Quantile, Whole
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import ParameterInfo, informed
@@ -72,6 +72,7 @@ class Spec(Component):
     block_size: Count | None = None
     readings: str | tuple[str, ...] | None = None
     find: str | tuple[str, ...] | None = None
+    gate: Quantile | None = None
     ignore_columns: str | tuple[str, ...] | None = None
     write_readings: str | None = None
     write_readings_trial: Whole = 0

@@ -13,9 +13,9 @@ from ipe_bench.plugins.construct import construct
 OF_ESTIMATE = {"solver": ("auto",), "baseline": ("linear_lse", "levenberg_marquardt")}
 """Estimators of `estimate`, by group: one that chooses its method itself, and two to compare it
 with."""
-THAT_FIND = {"tracker": ("ekf", "ukf")}
-"""Trackers of `find=`: a search needs a likelihood, which an estimate of the whole path does not
-have."""
+OF_FILTERS = {"tracker": ("ekf", "ukf")}
+"""Trackers of `find=` and `gate=`: these need a likelihood or innovations, which an estimate of the
+whole path does not have."""
 
 OF_OWN = {
     "solver": ("auto", "newton"),

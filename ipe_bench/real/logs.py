@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, ndtri
+from scipy.special import bdtrc, chdtr, chdtrc, chdtri, ndtri
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, Mask, deviations, unmasked
@@ -57,6 +57,9 @@ _FAR_BELOW = 10.0
 """By how much more than a tenth of the number of readings a log likelihood lies far below the
 largest of the log."""
 _MOST_OUTLIERS = 5
+_MOST_GATED = 0.2
+"""Share of readings beyond the gate above which the model is wrong."""
+_MOST_GATED_SHOWN = 10
 _FEW = 3
 _SHARE = 0.05
 """Share of outliers above which the model is wrong, and no list of epochs helps."""
@@ -324,6 +327,10 @@ class LogTracks:
     """Whether later readings count."""
     found: str = ""
     """The verdict on the search for them; empty if one maximum was found."""
+    gated: Mask | None = None
+    """Readings (K, m) beyond the gate, which are left out; None without a gate."""
+    share_gated: float = 0.0
+    """Their share of all readings."""
     notes: Sequence[str] = ()
     """Constants that are held at 0, other maxima that the searches have found, a second path that
     fits, and the epochs of outliers."""
@@ -336,7 +343,12 @@ class LogTracks:
         deviation = deviations(tracks.covariance[0]) * sizes
         innovations = tracks.innovations.swapaxes(1, 2)
         predicted, predicted_deviation = tracks.predicted_readings(log.z[None])
+        gated = None if tracks.gated is None else tracks.gated[0]
         missing = np.isnan(log.z)
+        share = 0.0
+        if gated is not None:
+            share = float(gated.sum() / (~missing).sum())
+            missing |= gated
         if missing.any():
             h, spread = _readings_at(log.model, tracks)
             predicted = np.where(missing, h, predicted)
@@ -348,12 +360,15 @@ class LogTracks:
         m = int(np.isfinite(innovations).sum())
         if tracks.cost is not None:
             total = float(tracks.cost[0])
-            m = int(np.isfinite(log.z).sum())
+            m = int((~missing).sum())
+        total /= _mean_within(tracker.gate)
         fit_p = float(chdtrc(m, total)) if m else np.nan
         white = float(white_p(_judged_innovations(log, tracker, innovations))[0])
 
         effective = np.nan if tracks.effective is None else float(np.median(tracks.effective))
         lost_from = _lost_from(nis, tracks.degrees[0])
+        if gated is not None and tracker.gate is not None:
+            lost_from = _blind_from(gated.any(axis=1), 1 - tracker.gate)
         ended = Status.CONVERGED if tracks.status is None else Status(int(tracks.status[0]))
         message = "" if ended == Status.CONVERGED else f"{ended.label}: {ended.reason}"
         if tracks.by_epoch is not None and tracks.by_epoch[0]:
@@ -363,6 +378,11 @@ class LogTracks:
         whole = bool(np.isfinite([mean, deviation]).all())
         fits = not fit_p < FIT_LEVEL and not white < FIT_LEVEL
         held = not effective < _COLLAPSED and lost_from is None
+        if share > _MOST_GATED:
+            message = (
+                f"{100 * share:.0f} % of the readings lie beyond the gate, where a few should: the"
+                " model or its noise does not fit the log"
+            )
         return cls(
             label,
             tracker,
@@ -377,12 +397,18 @@ class LogTracks:
             fit_p=fit_p,
             white_p=white,
             log_likelihood=float(tracks.log_likelihood[0]) if tracks.degrees.any() else np.nan,
-            passes=whole and fits and held and ended == Status.CONVERGED,
+            passes=whole and fits and held and share <= _MOST_GATED and ended == Status.CONVERGED,
             message=messages.get(0, message),
             lost_from=lost_from,
             effective=effective,
             smooths=tracker.smooths,
-            notes=[*_second(log, tracks), *_worst(log, nis, lost_from)],
+            notes=[
+                *_second(log, tracks),
+                *_left_out(log, gated),
+                *_worst(log, nis, tracks.degrees[0], lost_from),
+            ],
+            gated=gated,
+            share_gated=share,
         )
 
     @property
@@ -396,6 +422,8 @@ class LogTracks:
             return COLLAPSED
         if self.found:
             return self.found
+        if self.share_gated > _MOST_GATED:
+            return WRONG
         if np.isnan(self.mean_nis):
             return NO_VERDICT
         if self.white_p < FIT_LEVEL:
@@ -462,10 +490,42 @@ def _lost_from(nis: Array, degrees: Array) -> int | None:
     return int(lost[0]) + 1 if len(lost) else None
 
 
-def _worst(log: Log, nis: Array, lost_from: int | None) -> list[str]:
+def _mean_within(gate: float | None) -> float:
+    """Computes the mean of a chi-square with one degree that is below its quantile `gate`."""
+    if gate is None:
+        return 1.0
+    most = chdtri(1.0, 1.0 - gate)
+    return float(chdtr(3.0, most) / gate)
+
+
+def _blind_from(gated: Mask, expected: float) -> int | None:
+    """Finds the first epoch, from 1 on, of gated readings from which on most epochs have some, more
+    of them than chance explains; None without one."""
+    following = np.cumsum(gated[::-1])[::-1]
+    left = np.arange(len(gated), 0, -1)
+    by_chance = bdtrc(following - 1.0, left, expected) > 1 - GATE
+    lost = np.flatnonzero(gated & (following > 0.5 * left) & ~by_chance)
+    return int(lost[0]) + 1 if len(lost) else None
+
+
+def _left_out(log: Log, gated: Mask | None) -> list[str]:
+    """Words the readings beyond the gate."""
+    if gated is None or not gated.any():
+        return []
+    at = np.argwhere(gated)
+    names = log.model.reading_names
+    listed = [f"{k + 1}" if len(names) == 1 else f"{k + 1} ({names[j]})" for k, j in at]
+    further = len(listed) - _MOST_GATED_SHOWN
+    others = f" and {further} more" if further > 0 else ""
+    return [
+        f"left out, as beyond the gate: {len(at)} of {np.isfinite(log.z).sum()} readings, at epochs"
+        f" {', '.join(listed[:_MOST_GATED_SHOWN])}{others}"
+    ]
+
+
+def _worst(log: Log, nis: Array, degrees: Array, lost_from: int | None) -> list[str]:
     """Words the epochs whose NIS (K,) is so large that chance has one in a whole log with a
     probability of 1 %, the worst first; none if the track is lost or they are many."""
-    degrees = np.isfinite(log.z).sum(axis=1)
     at = np.flatnonzero(np.isfinite(nis))
     beyond = at[chdtrc(degrees[at], nis[at]) < OUTLIER_LEVEL / max(len(at), 1)]
     if lost_from is not None or not 0 < len(beyond) <= max(_FEW, _SHARE * len(at)):
@@ -519,6 +579,7 @@ class LogQuestion:
         trackers: Mapping[str, Tracker],
         ignored: Sequence[str] = (),
         find: str | Sequence[str] = (),
+        gate: float | None = None,
     ) -> LogQuestion:
         """Reads the log, and checks that every tracker can follow it.
 
@@ -531,6 +592,8 @@ class LogQuestion:
                     f"readings=[{','.join(map(str, readings))}]: a track has one log; name one file"
                 )
             (readings,) = readings
+        if gate is not None:
+            trackers = {label: _gated(label, one, gate) for label, one in trackers.items()}
         require_parts(model)
         log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
         validate([StateScenario(log.model)], trackers, 1, untried=[])
@@ -545,6 +608,13 @@ class LogQuestion:
         return found_and_tracked(*one, self.find, watch) if self.find else LogTracks.of(*one)
 
 
+def _gated(label: str, tracker: Tracker, gate: float) -> Tracker:
+    try:
+        return tracker.gated(gate)
+    except UserError as error:
+        raise UserError(f"gate={gate:g}: trackers.{label} {error}") from None
+
+
 # Constants ---------------------------------------------------------------------------------------
 
 
@@ -552,8 +622,13 @@ def require_likelihood(log: Log, label: str, tracker: Tracker) -> None:
     """Refuses a tracker whose likelihood no search can maximise.
 
     Raises:
-        UserError: its likelihood is random, or it has none.
+        UserError: its likelihood is random, or it has none, or jumps.
     """
+    if tracker.gate is not None:
+        raise UserError(
+            f"find: the likelihood of trackers.{label} jumps where a reading passes its gate;"
+            " remove the gate"
+        )
     tracks, _ = track_safely(tracker, log.model, log.z[None])
     known = tracks.degrees.any() and np.isfinite(tracks.log_likelihood[0])
     if isinstance(tracker, Bootstrap) or not known:

@@ -43,6 +43,7 @@ from ipe_bench.states.steps import (
     scores,
     unit,
     updated,
+    within,
     zeros,
 )
 
@@ -64,6 +65,8 @@ class Kind(NamedTuple):
     """Whether a pass back follows."""
     about: bool = False
     """Whether f and h are linearised about the states of a path."""
+    gate: float | None = None
+    """The squared normalised innovation of a reading beyond which it counts as missing."""
 
 
 class Route(NamedTuple):
@@ -224,7 +227,10 @@ class _Form:
                 state = State(near(state.x, here, self.state_periods), state.F)
         h = _Recorded(self.h, d, self.periods)
         linear = law(h, state, State(here, root_here) if here and root_here else state)
-        found = updated(state, linear, law.noise(R, linear), z, self.periods, smooths)
+        M = law.noise(R, linear)
+        if self.kind.gate is not None:
+            z = within(z, linear, M, self.periods, self.kind.gate)
+        found = updated(state, linear, M, z, self.periods, smooths)
         for _ in range(1, self.kind.iterations):
             linear = law(h, state, found.state)
             found = updated(state, linear, law.noise(R, linear), z, self.periods, smooths)
@@ -274,10 +280,14 @@ def _read(
     M: Rows,
     H: Rows,
     smooths: bool,
+    gate: float | None = None,
     **carried: Vector,
 ) -> dict[str, Any]:
     """Takes in readings whose linear form is given."""
-    found = updated(State(x, F), Linear(y, HF, [], H), M, z, (), smooths)
+    linear = Linear(y, HF, [], H)
+    if gate is not None:
+        z = within(z, linear, M, (), gate)
+    found = updated(State(x, F), linear, M, z, (), smooths)
     return {**_shown(z, found, **carried), **_told_of_move(None, len(x))}
 
 
@@ -453,7 +463,7 @@ class _ByEpoch(Passes):
         super().__init__(model, kind)
         self._step = functools.cache(self._made)
 
-    def _made(self, text: Callable[..., Any], columns: int) -> Step:
+    def _made(self, text: Callable[..., Any], columns: int, gate: float | None = None) -> Step:
         """Returns the step of a transition or of readings with a root of noise of so many
         columns."""
         n = self.sizes.n
@@ -465,8 +475,11 @@ class _ByEpoch(Passes):
         else:
             each = Layout(z=m, y=m, HF=full(m, n), M=full(m, columns), H=full(m, n))
             shown = self.sizes.shown
-        recorded = partial(text, smooths=smooths)
-        what = text.__name__, smooths
+        options: dict[str, Any] = {"smooths": smooths}
+        if gate is not None:
+            options["gate"] = gate
+        recorded = partial(text, **options)
+        what = text.__name__, options
         return named_step(recorded, what, self.sizes.carried, [each], _NOTHING, shown)
 
     def there(self, z: Array, route: Route | None, carry: Array, shown: Array) -> None:
@@ -518,6 +531,7 @@ class _ByEpoch(Passes):
         at = here or state
         nearest = model.nearest if model.periods else None
         begun = carry.copy()
+        gate = self.kind.gate
         for _ in range(self.kind.iterations):
             law = rule.linearised(model.observation_at(k), at.x, at.F, nearest)
             if model.R_by_state:
@@ -531,8 +545,13 @@ class _ByEpoch(Passes):
             untold = self.kind.about and isinstance(rule, SigmaPoints)
             H = np.zeros(HF.shape) if untold else law.slopes(at.F)
             carry[:] = begun
-            shown[:] = self._run(_read, M, carry, [z, y, HF], [H])
+            shown[:] = self._run(_read, M, carry, [z, y, HF], [H], gate)
             at = self._carried(carry)
+            if gate is not None:
+                # What the first linearisation takes for missing is missing to all.
+                predicted = self.sizes.shown.part(shown, "predicted")
+                z = np.where(np.isfinite(predicted), z, np.nan)
+                gate = None
 
     def _run(
         self,
@@ -541,9 +560,10 @@ class _ByEpoch(Passes):
         carry: Array,
         before: Sequence[Array],
         after: Sequence[Array] = (),
+        gate: float | None = None,
     ) -> Array:
         trials = len(carry)
-        step = self._step(text, noise.shape[2])
+        step = self._step(text, noise.shape[2], gate)
         parts = [part.reshape(trials, -1) for part in (*before, noise, *after)]
         each = np.concatenate(parts, axis=1)[:, None]
         out = np.empty((trials, 1, step.shown))

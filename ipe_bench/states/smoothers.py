@@ -40,13 +40,21 @@ class Smoother(Tracker):
     filter: Filter = field(default_factory=Filter)
     """The filter whose tracks are smoothed."""
 
+    @property
+    def gate(self) -> float | None:
+        return self.filter.gate
+
     def hindrance(self, model: StateModel) -> str | None:
         return self.filter.hindrance(model)
 
+    def gated(self, gate: float) -> Smoother:
+        return replace(self, filter=self.filter.gated(gate))
+
     def track(self, model: StateModel, z: Array) -> Tracks:
         behind = self.filter
-        out, tracks = smoothed(model, z, behind.rule, behind.iterations)
+        out, tracks = smoothed(model, z, behind.rule, behind.iterations, gate=behind.gate)
         out.cost = tracks.nis.sum(axis=1)  # that of its path is chi-square at the minimum alone
+        out.gated = tracks.gated
         return out
 
 
@@ -90,11 +98,24 @@ class IteratedSmoother(Tracker):
             return super().hindrance(model)
         return self.first.hindrance(model)
 
+    @property
+    def gate(self) -> float | None:
+        return self.first.gate
+
+    def gated(self, gate: float) -> IteratedSmoother:
+        return replace(self, first=self.first.gated(gate))
+
     def track(self, model: StateModel, z: Array) -> Tracks:
         path = self.first.track(model, z)
+        if path.gated is not None:
+            # What the first filter takes for missing is missing to all.
+            z = np.where(path.gated, np.nan, z)
         if isinstance(self.rule, Taylor):
-            return self._by_tangents(PathDensity.of(model, z), path)
-        return self._by_points(model, z, path)
+            out = self._by_tangents(PathDensity.of(model, z), path)
+        else:
+            out = self._by_points(model, z, path)
+        out.gated = path.gated
+        return out
 
     def _by_tangents(self, density: PathDensity, path: Tracks) -> Tracks:
         model = density.model

@@ -226,6 +226,18 @@ class Update(NamedTuple):
     another."""
 
 
+def within(z: Vector, linear: Linear, M: Rows, periods: Sequence[float], most: float) -> Vector:
+    """Returns readings z with those missing whose squared innovation exceeds its variance by more
+    than a factor `most`."""
+    kept = []
+    y = near(linear.y, z, periods)
+    for reading, a, own, told in zip(z, y, M, linear.AF, strict=True):
+        apart = reading - a
+        variance = dot(own, own, dot(told, told))
+        kept.append(np.where(np.less_equal(apart * apart, most * variance), reading, np.nan))
+    return kept
+
+
 def updated(
     state: State, linear: Linear, M: Rows, z: Vector, periods: Sequence[float], smooths: bool
 ) -> Update:

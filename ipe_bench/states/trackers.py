@@ -9,15 +9,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from ipe_bench.basics.batches import join
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask
-from ipe_bench.basics.options import Component, Count
+from ipe_bench.basics.options import Component, Count, Quantile
 from ipe_bench.states.algebra import factor, lower_solve, transposed
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
@@ -72,6 +74,8 @@ class Tracks:
     one."""
     other_p: Array | None = None
     """The probability (trials,) of the second path beside the first, 0 where none was found."""
+    gated: Mask | None = None
+    """Readings (trials, K, m) that lie beyond the gate, and count as missing."""
     by_epoch: Mask | None = None
     """Trials (trials,) that were tracked again by the model's own functions, from which recorded
     ones differ there."""
@@ -171,6 +175,8 @@ class Tracker(Component, ABC):
     """As that of an estimator."""
     smooths: bool = False
     """Whether each epoch is estimated from all readings, those of later epochs included."""
+    gate: float | None = None
+    """The quantile beyond which a reading counts as missing."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -186,6 +192,14 @@ class Tracker(Component, ABC):
                 "leave it out"
             )
         return None
+
+    def gated(self, gate: float) -> Tracker:
+        """Returns the tracker to which readings beyond a quantile are missing.
+
+        Raises:
+            UserError: it takes no gate, with words that follow its label.
+        """
+        raise UserError("takes no gate; choose a filter, or the smoother behind one")
 
     @abstractmethod
     def track(self, model: StateModel, z: Array) -> Tracks:
@@ -226,6 +240,9 @@ class Filter(Tracker):
     """How transition and reading are linearised."""
     iterations: Count = 1
     """Linearisations of each reading."""
+    gate: Quantile | None = None
+    """A reading counts as missing if its squared innovation, divided by its variance, lies beyond
+    this quantile of the chi-square with one degree, such as 0.999."""
 
     def hindrance(self, model: StateModel) -> str | None:
         if not model.R_by_state:
@@ -240,8 +257,11 @@ class Filter(Tracker):
             )
         return None
 
+    def gated(self, gate: float) -> Filter:
+        return replace(self, gate=gate)
+
     def track(self, model: StateModel, z: Array) -> Tracks:
-        return filtered(model, z, self.rule, self.iterations)
+        return filtered(model, z, self.rule, self.iterations, gate=self.gate)
 
 
 def filtered(
@@ -251,10 +271,13 @@ def filtered(
     iterations: int = 1,
     path: Tracks | None = None,
     start: Normal | None = None,
+    gate: float | None = None,
 ) -> Tracks:
     """Runs the filter of the model that a rule linearises about the filter's own states, or about
-    those of a path; `start` replaces the prior."""
-    return _passed(model, z, Kind(rule, iterations, about=path is not None), path, start)[0]
+    those of a path; `start` replaces the prior, and readings beyond the quantile `gate` are
+    missing."""
+    kind = Kind(rule, iterations, about=path is not None, gate=_most(gate))
+    return _passed(model, z, kind, path, start)[0]
 
 
 def smoothed(
@@ -264,10 +287,11 @@ def smoothed(
     iterations: int = 1,
     path: Tracks | None = None,
     start: Normal | None = None,
+    gate: float | None = None,
 ) -> tuple[Tracks, Tracks]:
     """Runs the same filter and its smoother (Rauch, Tung and Striebel, AIAA J. 3, 1965), and
     returns what each of them finds, that of the smoother in front."""
-    smooth, tracks = passed(model, z, rule, iterations, path, start)
+    smooth, tracks = passed(model, z, rule, iterations, path, start, gate)
     lost = np.isnan(tracks.log_likelihood)
     smooth.lose(lost)
     for said in smooth.start:
@@ -282,11 +306,17 @@ def passed(
     iterations: int = 1,
     path: Tracks | None = None,
     start: Normal | None = None,
+    gate: float | None = None,
 ) -> tuple[Tracks, Tracks]:
     """Does the same, for paths that are a beginning: those that have no digits are there, too."""
-    kind = Kind(rule, iterations, smooths=True, about=path is not None)
+    kind = Kind(rule, iterations, smooths=True, about=path is not None, gate=_most(gate))
     tracks, smooth = _passed(model, z, kind, path, start)
     return smooth, tracks
+
+
+def _most(gate: float | None) -> float | None:
+    """Returns the squared normalised innovation at a quantile."""
+    return None if gate is None else float(chdtri(1.0, 1.0 - gate))
 
 
 def _passed(
@@ -335,7 +365,11 @@ def _found(there: Passes, found: Passed, z: Array, start: Normal) -> tuple[Track
     layout = there.sizes.shown
     n = there.sizes.n
     after = found.shown[:, 1:]
-    seen = np.isfinite(z)
+    predicted = layout.part(after, "predicted")
+    given = np.isfinite(z)
+    # A reading beyond the gate is missing, and has no innovation.
+    gated = given & np.isnan(predicted) & np.isfinite(layout.part(after, "nis"))
+    seen = given & ~gated
     log_likelihood, doubt = found.carried[:, -2:].T.copy()
     lost = doubt > BEYOND
     tracks = Tracks(
@@ -347,9 +381,10 @@ def _found(there: Passes, found: Passed, z: Array, start: Normal) -> tuple[Track
         log_likelihood=log_likelihood,
         calls=np.zeros(len(z)),
         start=start,
-        predicted=layout.part(after, "predicted"),
+        predicted=predicted,
         predicted_deviation=layout.part(after, "deviation"),
         root=layout.part(found.shown, "F"),
+        gated=None if there.kind.gate is None else gated,
     )
     tracks.lose(lost)
     if found.back is None:

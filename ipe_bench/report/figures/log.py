@@ -68,6 +68,7 @@ def draw_log(log: Log, tracks: Sequence[LogTracks]) -> Iterator[Drawing]:
         to = groups[0][0].mean[:, [i]] / state.size
         readings = state.size * nearest(log.z[:, own], to, periods)
         _draw_bands(ax, model.times, bands, look, readings)
+        _mark_left_out(ax, log, own, groups[0][0], readings)
         common.title(ax, with_unit(state.name, state.unit))
     for j, ax in zip(rest, axes[len(states) :], strict=False):
         _draw_predictions(ax, log, j, filters, look)
@@ -188,6 +189,24 @@ def _draw_bands(
         _mark_beyond(ax, times, band.high, color)
 
 
+def _mark_left_out(
+    ax: Axes, log: Log, places: Sequence[int], one: LogTracks, readings: Array
+) -> None:
+    """Marks the readings (K, kinds) of these places beyond a tracker's gate, at the panel's edge
+    where they lie outside."""
+    if one.gated is None:
+        return
+    low, high = ax.get_ylim()
+    margin = 0.04 * (high - low)
+    style: Any = {"linestyle": "none", "marker": "x", "color": _RED, "markersize": 5.0}
+    for j, values in zip(places, readings.T, strict=True):
+        out = one.gated[:, j]
+        if out.any():
+            label = f"left out by {one.label}"
+            shown = np.clip(values[out], low + margin, high - margin)
+            ax.plot(log.model.times[out], shown, label=label, **style)
+
+
 def _set_limits(ax: Axes, bands: Sequence[_Band], readings: Array) -> None:
     """Sets an axis that holds the means, and the bands and readings that are near to them."""
     middle = [band.mean for band in bands]
@@ -218,10 +237,13 @@ def _draw_predictions(
     steps = np.sum(np.abs(np.diff(predicted)))
     if steps <= _JUMP * len(predicted) * np.ptp(predicted):
         _draw_bands(ax, log.model.times, bands, look, z)
+        _mark_left_out(ax, log, [j], filters[0][0], z)
         common.title(ax, f"{name}: reading and prediction")
         return
     centred = _Band(0.0 * first.mean, first.deviation)
-    _draw_bands(ax, log.model.times, {label: centred}, look, z - first.mean[:, None])
+    z = z - first.mean[:, None]
+    _draw_bands(ax, log.model.times, {label: centred}, look, z)
+    _mark_left_out(ax, log, [j], filters[0][0], z)
     common.title(ax, f"{name}: reading less prediction of {label}")
 
 
@@ -240,7 +262,8 @@ def _draw_nis(ax: Axes, log: Log, one: LogTracks) -> str:
     t = log.model.times[there]
     nis = one.nis[there]
     # NIS of right innovations is chi-square with a degree per reading of the epoch.
-    degrees = np.isfinite(log.z).sum(axis=1)
+    seen = np.isfinite(log.z) if one.gated is None else np.isfinite(log.z) & ~one.gated
+    degrees = seen.sum(axis=1)
     limit = chdtri(degrees[there], ABOVE)
     above = nis > limit
     dot: Any = {"linestyle": "none", "marker": ".", "rasterized": len(nis) > _MANY}

@@ -53,6 +53,10 @@ _OF_PARTICLES = (
     " effective particles: 1 / sum of squared weights, the median of all epochs; collapsed: below"
     " 2."
 )
+_OF_GATES = (
+    "A reading whose own innovation lies beyond the gate counts as missing; NIS is divided by its"
+    " mean within the gate."
+)
 _OF_CONSTANTS = (
     f"Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
     " the innovations, so only whiteness tests the model. Intervals of uncertain deviations are"
@@ -113,6 +117,8 @@ class LogAnswer(Labelled[LogTracks]):
             columns[f"{name}_reading"] = self.log.z[:, j]
             columns[f"{name}_predicted"] = one.predicted[:, j]
             columns[f"{name}_predicted_deviation"] = one.predicted_deviation[:, j]
+            if one.gated is not None:
+                columns[f"{name}_left_out"] = one.gated[:, j]
         columns["nis"] = one.nis
         return pd.DataFrame(columns)
 
@@ -145,6 +151,8 @@ class LogAnswer(Labelled[LogTracks]):
         if np.isfinite([one.effective for one in found]).any():
             columns.append(texts("effective particles", [short(one.effective) for one in found]))
             notes.append(Legend(_OF_PARTICLES))
+        if any(one.gated is not None for one in found):
+            notes.append(Legend(_OF_GATES))
         if any(one.constants for one in found):
             notes.append(Legend(_OF_CONSTANTS))
         title = f"{self.log.model.name}: is the filter right?"

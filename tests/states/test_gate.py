@@ -1,0 +1,193 @@
+"""Readings beyond a gate: own filters, smoothers of logs without these readings, and what a log's
+answer says of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import ipe_bench as ib
+from ipe_bench.states import Filter, Formulas, IteratedSmoother, Smoother, Unscented, ekf
+
+GATE = 0.999
+LEVEL = Formulas(
+    next={"x": "x + w"},
+    readings={"z": "x"},
+    noise={"w": 0.5},
+    deviation={"z": 1.0},
+    spread={"x": 10.0},
+    count=40,
+)
+TURNED = Formulas(
+    next={"x": "x + 0.1*v", "v": "0.99*v + w"},
+    readings={"angle": "atan2(x, 2 + v**2)", "range": "sqrt(x**2 + 4)"},
+    noise={"w": 0.2},
+    deviation={"angle": 0.05, "range": 0.1},
+    period={"angle": 2 * np.pi},
+    start={"x": 1.0},
+    spread={"x": 0.3, "v": 0.3},
+    count=30,
+)
+BY_STATE = replace(TURNED, next={"x": "x + 0.1*v", "v": "0.99*v + w*(1 + x**2/10)"})
+FILTERS = {
+    "ekf": Filter(),
+    "iekf": Filter(iterations=3),
+    "ukf": Filter(Unscented()),
+}
+
+
+def spiked(model, trials=3):
+    """Readings with two spikes in one of them at a time, and one that is missing."""
+    z = model.draw(0, trials, 1).z.copy()
+    z[0, 10, 0] += 30.3
+    z[1, 20, -1] -= 50.0
+    z[2, 5] = np.nan
+    return z
+
+
+def own_ekf(model, z, most):
+    """The textbook filter of one trial, which leaves out each reading that is too far from its
+    prediction; returns means, covariances and which were left out."""
+    x, P = model.prior
+    means = []
+    covariances = []
+    left_out = np.zeros(z.shape, dtype=bool)
+
+    def slopes(function, x, k):
+        columns = [function(x + 1e-20j * e, k).imag / 1e-20 for e in np.eye(len(x))]
+        return np.stack(columns, axis=1)
+
+    for k in range(model.epochs):
+        G = model.gain_at(x[None], k)
+        G = G[0] if G.ndim == 3 else G
+        F = slopes(model.transition, x, k)
+        x = model.transition(x, k)
+        P = F @ P @ F.T + G @ G.T
+        H = slopes(model.observe, x, k)
+        R = model.R(k)
+        y = z[k] - model.observe(x, k)
+        for j, period in enumerate(model.periods):
+            if period:
+                y[j] -= period * np.round(y[j] / period)
+        S = H @ P @ H.T + R
+        left_out[k] = y**2 > most * np.diag(S)
+        rows = np.flatnonzero(np.isfinite(y) & ~left_out[k])
+        K = P @ H[rows].T @ np.linalg.inv(S[np.ix_(rows, rows)])
+        x = x + K @ y[rows]
+        P = P - K @ S[np.ix_(rows, rows)] @ K.T
+        means.append(x)
+        covariances.append(P)
+    return np.array(means), np.array(covariances), left_out
+
+
+@pytest.mark.parametrize("model", [LEVEL, TURNED, BY_STATE], ids=["level", "turned", "by_state"])
+def test_a_gate_leaves_out_what_the_textbook_filter_leaves_out(model):
+    z = spiked(model)
+    tracks = Filter(gate=GATE).track(model, z)
+    for trial in range(len(z)):
+        x, P, left_out = own_ekf(model, z[trial], chi2.ppf(GATE, 1))
+        np.testing.assert_array_equal(tracks.gated[trial], left_out)
+        np.testing.assert_allclose(tracks.mean[trial], x, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(tracks.covariance[trial], P, rtol=1e-8, atol=1e-12)
+    assert tracks.gated[0, 10].tolist() == [True, *[False] * (z.shape[2] - 1)]
+    assert tracks.gated[1, 20, -1]
+    assert not tracks.gated[2, 5].any()
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("model", [LEVEL, TURNED, BY_STATE], ids=["level", "turned", "by_state"])
+def test_what_lies_beyond_the_gate_is_missing(model, name):
+    """Bit for bit the track of a log without it, alone and among others, and that of its
+    smoother."""
+    z = spiked(model)
+    one = FILTERS[name]
+    for plain in (one, Smoother(one)):
+        gated = plain.gated(GATE)
+        tracks = gated.track(model, z)
+        assert tracks.gated.sum() >= 2
+        without = plain.track(model, np.where(tracks.gated, np.nan, z))
+        alone = gated.track(model, z[1:2])
+        for part in ("mean", "covariance", "nis", "log_likelihood", "degrees"):
+            np.testing.assert_array_equal(getattr(tracks, part), getattr(without, part))
+            np.testing.assert_array_equal(getattr(tracks, part)[1:2], getattr(alone, part))
+
+
+def test_a_path_is_that_of_the_readings_that_its_first_filter_takes():
+    z = spiked(LEVEL)
+    tracks = IteratedSmoother().gated(GATE).track(LEVEL, z)
+    behind = Smoother().gated(GATE).track(LEVEL, z)
+    assert tracks.gated.sum() == 2
+    np.testing.assert_allclose(tracks.mean, behind.mean, atol=1e-10)
+
+
+def test_a_whole_turn_is_not_beyond_the_gate():
+    z = TURNED.draw(0, 1, 3).z
+    turned = z + np.array([2 * np.pi, 0.0])
+    one, other = (Filter(gate=GATE).track(TURNED, each) for each in (z, turned))
+    np.testing.assert_array_equal(one.gated, other.gated)
+    np.testing.assert_allclose(one.mean, other.mean, rtol=1e-9, atol=1e-12)
+
+
+def test_a_log_names_what_is_left_out_and_fits():
+    z = LEVEL.draw(0, 1, 1).z[0].copy()
+    z[10] += 30
+    z[25] -= 20
+    (plain,) = ib.estimate(LEVEL, z, {"ekf": ekf()})
+    (one,) = ib.estimate(LEVEL, z, {"ekf": Filter(gate=GATE)})
+    assert not plain.passes
+    assert (one.passes, one.verdict) == (True, "consistent")
+    (note,) = one.notes
+    assert note == "left out, as beyond the gate: 2 of 40 readings, at epochs 11, 26"
+    table = ib.estimate(LEVEL, z, {"ekf": Filter(gate=GATE)}).table()
+    assert np.flatnonzero(table["z_left_out"]).tolist() == [10, 25]
+    # A reading that is left out is predicted all the same.
+    assert np.isfinite(table["z_predicted"]).all()
+
+
+def test_the_mean_of_nis_is_one_though_a_gate_leaves_out_its_largest():
+    """Of a chi-square with one degree that is cut at its 99 % quantile the mean is 0.925."""
+    long = replace(LEVEL, count=4000)
+    (one,) = ib.estimate(long, long.draw(0, 1, 2).z[0], {"ekf": Filter(gate=0.99)})
+    assert one.mean_nis == pytest.approx(1.0, abs=0.05)
+    assert one.mean_nis * 0.9247 == pytest.approx(np.nanmean(one.nis), rel=1e-3)
+    assert one.share_gated == pytest.approx(0.01, abs=0.005)
+    assert one.passes
+
+
+def test_a_model_whose_readings_lie_beyond_the_gate_is_a_misfit():
+    """Readings three times as noisy as stated lie beyond the 95 % quantile in half of all cases."""
+    z = replace(LEVEL, deviation={"z": 3.0}).draw(0, 1, 1).z[0]
+    (one,) = ib.estimate(LEVEL, z, {"ekf": Filter(gate=0.95)})
+    assert one.share_gated > 0.2
+    assert (one.passes, one.verdict) == (False, "wrong")
+    assert "of the readings lie beyond the gate" in one.message
+
+
+def test_a_filter_that_takes_no_reading_any_more_is_lost():
+    z = LEVEL.draw(0, 1, 1).z[0].copy()
+    z[34:] += 500
+    (one,) = ib.estimate(LEVEL, z, {"ekf": Filter(gate=GATE)})
+    assert (one.verdict, one.passes) == ("lost from epoch 35", False)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (
+            ["tracker=[auto]", "gate=0.99"],
+            "gate=0.99: trackers.auto takes no gate; choose a filter",
+        ),
+        (["tracker=[ekf]", "gate=0.99", "find=[w]"], "find: the likelihood of trackers.ekf jumps"),
+        (["tracker=[ekf]", "gate=0"], "gate=0.0: give a number above 0 and up to 1"),
+    ],
+)
+def test_what_takes_no_gate_says_so(ipe_bench, tmp_path, words, complaint):
+    (tmp_path / "log.csv").write_text("z\n1\n2\n3\n")
+    model = "next.x=x+w readings.z=x noise.w=1 deviation.z=1 spread.x=1"
+    given = [f"state_model.{word}" for word in model.split()]
+    told = ipe_bench("estimate", "state_model=formulas", *given, "readings=log.csv", *words)
+    assert told[0] == 2
+    assert complaint in told[2]
