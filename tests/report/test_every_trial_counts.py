@@ -335,6 +335,11 @@ def cut_where_it_falls(shown: Any, analysis: Analysis) -> Iterator[str]:
     for name, drawing in shown.items():
         for ax in drawing.figure.axes:
             low, high = sorted(ax.get_ylim())
+            arrows = [line for line in ax.lines if "arrow" in str(line.get_marker())]
+            for line in ax.lines if name == "tracks" else ():
+                is_named = str(line.get_gid()).startswith("name:")
+                if is_named and (np.asarray(line.get_ydata()) > high).any() and not arrows:
+                    yield "tracks: a curve leaves the panel without an arrow"
             for line in ax.lines:
                 if not is_curve(line) or name == "tracks" or not line.get_clip_on():
                     continue

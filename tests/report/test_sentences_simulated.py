@@ -8,7 +8,8 @@ false. A sentence without a kind fails the test, so that a new sentence needs a 
 under `@sentence(pattern)` or `@entries`.
 
 The table "kind, times printed, times false, upper limit" of as many reports as one likes, from the
-first on: `PYTHONPATH=tests python tests/report/test_sentences_simulated.py 1000`
+first seed on or from another: `PYTHONPATH=tests python tests/report/test_sentences_simulated.py
+1000 50000`
 """
 
 from __future__ import annotations
@@ -506,6 +507,21 @@ def verdicts(report: Report) -> Iterator[Claim]:
 
 
 @entries
+def bars(report: Report) -> Iterator[Claim]:
+    """Infers that bars of figures hold what is so in the population. Each is an interval for
+    itself: the last one drawn stands for the others of a report."""
+    row = report.analysis.summary.query("parameter == 'all'").to_dict("records")[-1]
+    scale, label = row["error_scale"], row["estimator"]
+    success = report.board.success(label)[report.board.scales.index(scale)]
+    held = row["success_low"] <= success <= row["success_high"]
+    yield Claim("bar of success", INFERS, label, not held)
+    low, high = row["nees_mean_low"], row["nees_mean_high"]
+    if not np.isnan(low):
+        mean = report.population(scale, label).mean_nees
+        yield Claim("bar of NEES", INFERS, label, mean < low or mean > high)
+
+
+@entries
 def bold(report: Report) -> Iterator[Claim]:
     """Infers, of a scenario where some are in bold, that those who are not are not the best."""
     whole = report.analysis.summary.query("parameter == 'all'")
@@ -549,10 +565,10 @@ def judged(seed: int, largest: bool = True) -> list[Claim]:
     return list(claims_of(simulated(board(seed, largest=largest))))
 
 
-def of_seeds(number: int) -> list[list[Claim]]:
+def of_seeds(number: int, first: int = 0) -> list[list[Claim]]:
     """Judges so many reports, in two processes."""
     with ProcessPoolExecutor(2) as pool:
-        return list(pool.map(judged, range(number), chunksize=5))
+        return list(pool.map(judged, range(first, first + number), chunksize=5))
 
 
 def tallies(reports: list[list[Claim]]) -> list[Tally]:
@@ -649,4 +665,4 @@ def test_what_a_report_infers_is_false_in_few_of_those_that_say_it():
 
 
 if __name__ == "__main__":
-    print(shown(tallies(of_seeds(int(sys.argv[1])))))
+    print(shown(tallies(of_seeds(*map(int, sys.argv[1:])))))

@@ -224,7 +224,8 @@ def test_1000_studies_of_a_root_mean_square(law):
 @pytest.mark.parametrize(("n", "trials"), [(1, 40), (3, 40), (11, 40), (3, 200)])
 def test_the_factor_that_trials_leave_open_is_too_small_in_at_most_a_twentieth(law, n, trials):
     """Of all reports, those in which few trials carry the mean, and no factor is said, among them.
-    Trials of heavy tails that say one look normal: of these alone it is too small in 5 to 15 % at 40 trials."""
+    Trials of heavy tails that say one look normal: of these alone it is too small in 5 to 15 %
+    at 40 trials."""
     draw, mean = LAWS[law]
     squares = np.square(draw(np.random.default_rng([n, trials]), (trials, 600, n))).mean(axis=2)
     said = ~few_carry(Squares.of(squares.T), np.full(600, n))

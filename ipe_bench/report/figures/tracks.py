@@ -90,6 +90,9 @@ def _draw_errors(ax: Any, rows: pd.DataFrame, one: Look, ends: tuple[float, floa
     ax.set_yscale("log")
     ax.set_ylim(*ends)
     common.log_ticks(ax.yaxis, *ends)
+    lost = at[~(median <= ends[1])]
+    # An arrow at a third of the epochs at most: side by side they would be a bar.
+    common.mark_cut(ax, lost[:: len(lost) // 3 + 1], ends[1], one.color, downwards=False)
 
 
 def _draw_nees(
