@@ -99,8 +99,8 @@ class Sizes:
     def told(self) -> Layout:
         """What a step back takes of an epoch."""
         n = self.n
-        read = {"X": full(n, self.m), "Y": full(n, n), "Z": triangle(n)}
-        return Layout(x=n, F=triangle(n), e=self.m, **read, **self.moved.shapes)
+        read = full(n, self.m + n)
+        return Layout(x=n, F=triangle(n), e=self.m, read=read, **self.moved.shapes)
 
     @cached_property
     def shown(self) -> Layout:
@@ -250,16 +250,14 @@ def _back(
     x: Vector,
     F: Rows,
     e: Vector,
-    X: Rows,
-    Y: Rows,
-    Z: Rows,
+    read: Rows,
     moved: Rows,
     noise: Rows,
 ) -> dict[str, Any]:
     """Steps back from an epoch to the one before."""
     after = Smoothed(u, S)
     state = after.of(State(x, F))
-    before = after.before(e, beside(X, Y, Z), beside(moved, noise))
+    before = after.before(e, read, beside(moved, noise))
     return {**before._asdict(), **state._asdict(), "covariance": gram(state.F)}
 
 
@@ -293,19 +291,14 @@ def _read(
 
 def _shown(z: Vector, found: Update, log_likelihood: Vector, doubt: Vector) -> dict[str, Any]:
     """Names what an update carries on and shows."""
-    n = len(found.state.x)
-    m = len(z)
     state, e, L, in_doubt, read = found
     nis, told = scores(e, L)
-    X, Y, Z = ([row[a:b] for row in read] for a, b in ((0, m), (m, m + n), (m + n, m + 2 * n)))
     return {
         **state._asdict(),
         "log_likelihood": [log_likelihood[0] + told],
         "doubt": [np.maximum(doubt[0], in_doubt)],
         "e": e,
-        "X": X,
-        "Y": Y,
-        "Z": Z,
+        "read": read,
         "nis": [nis],
         "predicted": [a - dot(row, e) for a, row in zip(z, L, strict=True)],
         "deviation": [np.sqrt(dot(row, row)) for row in L],

@@ -222,8 +222,8 @@ class Update(NamedTuple):
     doubt: Number
     """The largest variance of what is read by the digits of a float, in parts of a reading's."""
     told: Rows
-    """For a smoother rows (X, Y, Z): the old unit noise is X e, Y times the new one, and Z times
-    another."""
+    """For a smoother rows (X, Y): the old unit noise is X e, and Y times the new one. Other noise
+    is left of it in columns that the root of the states has not."""
 
 
 def within(z: Vector, linear: Linear, M: Rows, periods: Sequence[float], most: float) -> Vector:
@@ -263,7 +263,7 @@ def updated(
     x = plus(state.x, [row[:m] for row in after], e)
     F = [row[m : m + n] for row in after]
     doubt = _doubt(state, linear.A, [row[:columns] for row in read])
-    return Update(State(x, F), e, L, doubt, both[m + n :])
+    return Update(State(x, F), e, L, doubt, [row[: m + n] for row in both[m + n :]])
 
 
 def _doubt(state: State, H: Rows, M: Rows) -> Number:
@@ -301,9 +301,8 @@ class Smoothed(NamedTuple):
         """Returns the same of the epoch before, by what an update and a transition told."""
         m = len(e)
         n = len(self.u)
-        X, Y, Z = ([row[a:b] for row in read] for a, b in ((0, m), (m, m + n), (m + n, m + 2 * n)))
-        u = plus(plus([0.0] * n, X, e), Y, self.u)
-        S = lower(beside(product(Y, self.S), Z))
+        u = plus([0.0] * n, read, [*e, *self.u])
+        S = lower(product([row[m:] for row in read], self.S))
         X = [row[:n] for row in moved]
         Y = [row[n:] for row in moved]
         return Smoothed(plus([0.0] * n, X, u), lower(beside(product(X, S), Y)))

@@ -166,6 +166,8 @@ def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -
         rows = np.arange(trials)
         x = at.x
         line = middle.line
+        # Each side by itself: which of them comes first is the sign of an axis, which is round-off.
+        side = np.ones(trials)
         for number in range(1, _POINTS + 1):
             t = sign * _STRIDE * number
             some = density.subset(rows)
@@ -185,12 +187,13 @@ def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -
             counted = np.isfinite(second).all(axis=(1, 2, 3)) & np.isfinite(weight)
             weight = np.where(counted, weight, 0.0)
             second = np.where(counted[:, None, None, None], second, 0.0)
-            total[rows] += weight
+            side[rows] += weight
             moment[rows] += weight[:, None, None, None] * second
-            going = weight * t**2 > _LITTLE * total[rows]
+            going = weight * t**2 > _LITTLE * side[rows]
             if not going.any():
                 break
             rows = rows[going]
             x = there.x[going]
             line = here.line[going]
+        total += side - 1.0
     return Around(moment / total[:, None, None, None], total / _OF_NORMAL, middle.size, calls)

@@ -202,3 +202,23 @@ def test_a_covariance_holds_on_the_side_where_the_cost_rises_slowly():
     w = np.exp(-((x / 4) ** 2 + ((0.4 - 2 / (2 + x)) / 0.1) ** 2) / 2)
     exact = np.sum(w * (x - found.mean[0, 0, 0]) ** 2) / np.sum(w)
     assert 0.7 * exact < found.covariance[0, 0, 0, 0] < 1.3 * exact
+
+
+def test_readings_of_the_other_sign_have_the_same_covariance():
+    """A pendulum at rest and its mirror image: an axis along which the density is followed has no
+    sign, so that neither side of it is the first."""
+    model = Formulas(
+        next={"angle": "angle + 0.1*rate", "rate": "rate - sin(angle) + w"},
+        noise={"w": 0.3},
+        spread={"angle": 1.0, "rate": 1.0},
+        readings={"z": "sin(angle)"},
+        deviation={"z": 0.3},
+        count=6,
+    )
+    z = model.draw(0, 40).z
+    tracker = LevenbergMarquardtSmoother(tolerance=1e-6)
+    one, other = (tracker.track(model, sign * z) for sign in (1.0, -1.0))
+    alike = np.abs(one.cost - other.cost) < 1e-6
+    assert alike.mean() > 0.9
+    assert (np.abs(one.mean + other.mean)[alike] < 1e-4).all()
+    assert_agrees(other.covariance[alike], one.covariance[alike], rtol=1e-4, atol=1e-6)
