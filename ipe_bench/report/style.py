@@ -51,6 +51,8 @@ _LEGIBLE = 0.18
 """Largest relative luminance of letters on white."""
 _BRIGHT = 0.22
 """Least relative luminance of letters on a dark page."""
+_SEEN = 0.117
+"""Least relative luminance of lines and marks on a dark page: a contrast of 3."""
 _MIDDLE = 0.179
 """Relative luminance that has the same contrast with black and with white."""
 DARK = "#0d1117"
@@ -253,8 +255,8 @@ def _linear(c: float) -> float:
 
 def dark(color: str, *, letters: bool = False) -> str:
     """Returns what a colour on white becomes on a dark page: that of success is of the dark colours
-    of success, greys change places, and the others are lighter, those of `letters` until they have
-    a contrast of 4.5."""
+    of success, greys change places, and the others are lighter, until lines have a contrast of 3
+    and `letters` one of 4.5."""
     from matplotlib.colors import to_hex, to_rgb
 
     if color in RAMP:
@@ -262,8 +264,9 @@ def dark(color: str, *, letters: bool = False) -> str:
     rgb: Any = to_rgb(color)
     if max(rgb) - min(rgb) > 0.05:
         rgb = [c + 0.25 * (1 - c) for c in rgb]
-        while letters and _luminance(rgb) < _BRIGHT:
-            rgb = [c + 0.03 * (1 - c) for c in rgb]
+        least = _BRIGHT if letters else _SEEN
+        while _luminance(rgb) < least:
+            rgb = [c + 0.01 * (1 - c) for c in rgb]
         return to_hex(rgb)
     # White becomes the first end, black the second.
     share = 1 - rgb[0]

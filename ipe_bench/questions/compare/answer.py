@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -180,6 +181,11 @@ def _column(title: str, cells: Sequence[str]) -> Column:
 def _joined(tables: Sequence[Table], legends: Sequence[str]) -> Table:
     """Puts tables of the same columns below each other, their titles in a column, and below them
     what the columns mean."""
+    if len(tables) == 1:
+        (table,) = tables
+        first, *others = table.columns
+        columns = [replace(first, title="quantity"), *others]
+        return replace(table, columns=columns, notes=[*table.notes, *legends])
     titles = list(dict.fromkeys(column.title for table in tables for column in table.columns))
     names = [table.title for table in tables for _ in table.rows]
     columns = [words("comparison", names)]

@@ -10,7 +10,7 @@ import numpy as np
 from ipe_bench.questions.compare.maths import comparison_title
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import BOUND_COLOR, FAMILIES, Look, print_width
+from ipe_bench.report.style import BOUND_COLOR, FAMILIES, WHITE, Look, strong
 from ipe_bench.report.words import compact, told_apart
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def draw_pairs(frame: pd.DataFrame) -> Iterator[Drawing]:
     kinds = list(dict.fromkeys(row["quantity"] for row in rows))[: common.most_panels()]
     look = dict.fromkeys(labels[:MOST_ROWS], Look(BOUND_COLOR, "o"))
     fig, axes = common.panels(len(kinds), look, scales=[0.0], row=1)
-    fig.set_figwidth(print_width() or 7.6)
+    fig.set_figheight((0.4 * len(look) + 0.75) * len(kinds) + 0.3)
     for kind, ax in zip(kinds, axes, strict=True):
         measure = _measure(kind, frame.attrs["margins"][kind.partition(" ")[0]])
         named = [(row, name) for row, name in zip(rows, names, strict=True) if name in look]
@@ -105,9 +105,10 @@ def _draw_change(ax: Axes, row: Any, y: int, measure: _Measure) -> None:
     face = color if row["finding"] else "white"
     point: Any = {"color": color, "markerfacecolor": face, "markeredgecolor": color}
     ax.plot(measure.factor * row["change"], y, "o", **point)
-    style: Any = {"va": "center", "fontsize": "small", "annotation_clip": False}
+    style: Any = {"color": strong(color), "annotation_clip": False, "va": "bottom"}
+    style["bbox"] = {"facecolor": WHITE, "edgecolor": "none", "pad": 1.0}
     place: Any = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
-    ax.annotate(_outcome(row, low, high, measure), (1, y), xytext=(6, 0), **place, **style)
+    ax.annotate(_outcome(row, low, high, measure), (0, y), xytext=(3, 5), **place, **style)
 
 
 def _set_axis(ax: Axes, measure: _Measure) -> None:

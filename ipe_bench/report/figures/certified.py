@@ -17,10 +17,17 @@ from ipe_bench.report.style import BOUND_COLOR, RAMP, ink
 from ipe_bench.report.words import percent
 from ipe_bench.statistics.certified import certified_table, published_table
 
+_FOUND = "#0b5a8f"
 SOLVED = 4
 """Digits from which on a problem is solved."""
 _STEPS = {0: RAMP[0], 1: RAMP[4], 2: RAMP[8], 3: RAMP[11], SOLVED: RAMP[18], 8: RAMP[20]}
 """Colours from so many digits on: dark where a problem is solved."""
+
+
+_LETTERS = 9.5
+"""Points of letters in and beside the cells."""
+_CELL = (0.28, 0.21)
+"""Inches of a cell."""
 
 
 def draw_digits(view: View) -> Iterator[Drawing]:
@@ -30,32 +37,31 @@ def draw_digits(view: View) -> Iterator[Drawing]:
     if table.empty:
         return
     table["digits"] = np.floor(table["lre_parameters"].fillna(0.0))
-    of_problems = table.groupby("dataset")["digits"].mean().sort_values()
-    of_estimators = table.groupby("estimator")["digits"].mean().sort_values()
-    problems = of_problems.index
-    estimators = of_estimators.index[::-1]
+    of_problems = table.groupby("dataset")["digits"].mean()
+    of_estimators = table.groupby("estimator")["digits"].mean()
+    problems = of_problems.sort_values().index
+    estimators = of_estimators.sort_values().index[::-1]
     starts = sorted(set(table["start"]))
     fig, axes = common.panels(len(starts), row=2)
-    fig.set_size_inches(1.3 + 4.4 * len(axes), 1.8 + 0.2 * len(problems))
+    width = 1.1 + _CELL[0] * len(estimators)
+    fig.set_size_inches(width * len(axes), 2.0 + _CELL[1] * len(problems))
     for start, ax in zip(starts, axes, strict=True):
-        here = table[table["start"] == start].pivot_table("digits", "dataset", "estimator")
-        _draw_cells(ax, here.reindex(index=problems, columns=estimators))
+        here = table[table["start"] == start]
+        digits = here.pivot_table("digits", "dataset", "estimator")
+        _draw_cells(ax, digits.reindex(index=problems, columns=estimators))
         ax.set(xlabel="", ylabel="", title=f"start {start}")
-        ax.set_xticks(ax.get_xticks(), [common.text(e) for e in estimators], rotation=90)
-        ax.set_yticks(np.arange(len(problems)) + 0.5, list(problems), rotation=0)
     best = str(estimators[0])
-    solved = table["digits"][table["estimator"] == best] >= SOLVED
-    yield view.drawing(
-        fig,
-        "digits",
-        "Correct digits of certified parameters, of 11",
+    is_solved = table["digits"][table["estimator"] == best] >= SOLVED
+    share = percent(float(is_solved.mean()))
+    caption = (
         f"Of the parameter with fewest; dark: {SOLVED} or more, solved. Hardest problems first,"
-        f" best estimators left: {best} solves {percent(float(solved.mean()))}.",
+        f" best estimators left: {best} solves {share}."
     )
+    yield view.drawing(fig, "digits", "Correct digits of certified parameters, of 11", caption)
 
 
 def _draw_cells(ax: Any, digits: pd.DataFrame) -> None:
-    """Draws a coloured cell with each number of digits."""
+    """Draws a coloured cell with each number of digits, and the names beside the cells."""
     import seaborn as sns
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
@@ -64,8 +70,13 @@ def _draw_cells(ax: Any, digits: pd.DataFrame) -> None:
     style: Any = {"cbar": False, "annot": True, "fmt": ".0f", "linewidths": 0.8}
     sns.heatmap(digits, ax=ax, cmap=colors, norm=norm, **style)
     for text in ax.texts:
-        step = max(k for k in _STEPS if k <= int(text.get_text()))
-        text.set(color=ink(_STEPS[step]), fontsize="small")
+        reached = [step for step in _STEPS if step <= int(text.get_text())]
+        ground = _STEPS[max(reached)]
+        text.set(color=ink(ground), fontsize=_LETTERS)
+    names = [common.text(estimator) for estimator in digits.columns]
+    ax.set_xticks(ax.get_xticks(), names, rotation=90, fontsize=_LETTERS)
+    middles = np.arange(len(digits)) + 0.5
+    ax.set_yticks(middles, list(digits.index), rotation=0, fontsize=_LETTERS)
 
 
 def draw_published(view: View) -> Iterator[Drawing]:
@@ -78,20 +89,25 @@ def draw_published(view: View) -> Iterator[Drawing]:
     footers = [group.footer for group in view.collection.groups]
     units = {p["name"]: p["unit"] for footer in footers for p in footer["parameters"]}
     groups = list(table.groupby(["model", "state"], sort=False))[: common.MOST_PANELS]
-    fig, axes = common.panels(len(groups), dict.fromkeys(table["estimator"]), scales=[0.0])  # type: ignore[arg-type]
+    names: Any = dict.fromkeys(table["estimator"])
+    fig, axes = common.panels(len(groups), names, scales=[0.0])
     for ((model, state), rows), ax in zip(groups, axes, strict=True):
-        rows = rows.sort_values("published")
-        common.name_axis(ax, list(rows["estimator"]))
-        ring: Any = {"markersize": 9, "markerfacecolor": "white", "color": BOUND_COLOR}
-        y = np.arange(len(rows))
-        ax.plot(rows["published"], y, "o", label="published", **ring)
-        ax.plot(rows["found"], y, "o", markersize=4, color="#0b5a8f", label="found")
-        ax.set(xlabel="root mean square error", xlim=(0, None))
+        _draw_rings(ax, rows.sort_values("published"))
         common.title(ax, f"{model}, {with_unit(str(state), units[str(state)])}")
     common.legend(fig, axes)
     most = table["difference"].abs().max()
     caption = f"Errors along the published path; the largest difference is {most:.1e}."
     yield view.drawing(fig, "published", "Published errors and those found", caption)
+
+
+def _draw_rings(ax: Any, rows: pd.DataFrame) -> None:
+    """Draws the errors of estimators, a row for each, within the published ones."""
+    common.name_axis(ax, list(rows["estimator"]))
+    y = np.arange(len(rows))
+    ring: Any = {"markersize": 9, "markerfacecolor": "white", "color": BOUND_COLOR}
+    ax.plot(rows["published"], y, "o", label="published", **ring)
+    ax.plot(rows["found"], y, "o", markersize=4, color=_FOUND, label="found")
+    ax.set(xlabel="root mean square error", xlim=(0, None))
 
 
 FIGURES = (

@@ -38,6 +38,8 @@ _MOST_LETTERS = 30
 """Length of a label that curves share."""
 _TEXT = -1
 """The number of a name among the artists of its curve."""
+_ALONE = 4.2
+"""Inches of a figure of a single panel: its letters are read on a phone."""
 _AROUND = 90.0
 """Points of a figure's height above and below a panel, about."""
 BEYOND = "beyond the axis"
@@ -69,7 +71,7 @@ def panels(
 
     down = -(-count // min(row, _across()))
     across = -(-count // down)
-    width = print_width() or min(2.0 + 3.2 * across, 11.0)
+    width = print_width() or (_ALONE if across == 1 else min(2.0 + 3.2 * across, 11.0))
     names = list(look or ())
     each = min(height, 0.85 * width / across)
     size = (width, each * down + 0.4 + 0.05 * len(names))
@@ -339,6 +341,15 @@ def shares(ax: Axes) -> None:
     ax.set(**{f"{axis}lim": (-0.03, 1.03)})
     of_values = ax.xaxis if axis == "x" else ax.yaxis
     of_values.set_major_formatter(lambda share, _: f"{100 * share:.0f} %")
+
+
+def times(seconds: pd.Series[Any]) -> tuple[Array, str]:
+    """Returns times in a unit in which they are short, and its axis's label."""
+    at = seconds.to_numpy(float)
+    last = float(np.abs(at).max())
+    if last < 300:
+        return at, "time [s]"
+    return (at / 60, "time [min]") if last < 6 * 3600 else (at / 3600, "time [h]")
 
 
 def bound_line(ax: Axes, at: float, label: str) -> None:

@@ -57,7 +57,6 @@ def draw_log(log: Log, tracks: Sequence[LogTracks]) -> Iterator[Drawing]:
     colors = looks_of(shown)
     look = {_name(group): Look(colors[group[0].label].color, "") for group in groups}
     fig, axes = common.panels(len(states) + len(rest) + bool(filters), look, height=2.0, row=2)
-    fig.set_figwidth(10.4)
     for i, (state, ax) in enumerate(zip(states, axes, strict=False)):
         own = [j for j, state_read in read.items() if state_read == i]
         bands = {

@@ -73,21 +73,12 @@ def _looks(view: View, trackers: Sequence[str]) -> dict[str, Look]:
     return {label: Look(color, "") for label, color in zip(shown, _COLORS, strict=False)}
 
 
-def _times(rows: pd.DataFrame) -> tuple[Array, str]:
-    """Returns the times in a unit in which they are short, and its axis's label."""
-    at = rows["at"].to_numpy(float)
-    last = float(np.abs(at).max())
-    if last < 300:
-        return at, "time [s]"
-    return (at / 60, "time [min]") if last < 6 * 3600 else (at / 3600, "time [h]")
-
-
 def _draw_state(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:
     """Draws a state; its axis holds the truth and the best track's band, and may cut the others."""
     kept: list[Array] = []
     for label, one in reversed(list(look.items())):
         own = rows[rows["estimator"] == label]
-        at, name = _times(own)
+        at, name = common.times(own["at"])
         mean = own["mean"].to_numpy(float)
         half = _DEVIATIONS * own["deviation"].to_numpy(float)
         ax.fill_between(at, mean - half, mean + half, color=one.color, alpha=0.2, linewidth=0)
@@ -111,7 +102,7 @@ def _limit(set_limits: Any, kept: Sequence[Array]) -> None:
 
 def _draw_reading(ax: Any, rows: pd.DataFrame) -> None:
     own = rows[rows["parameter"] == rows["parameter"].iloc[0]]
-    at, name = _times(own)
+    at, name = common.times(own["at"])
     ax.plot(at, own["mean"], ".", color=SOFT, markersize=3)
     ax.set_xlabel(name)
     common.title(ax, str(own["parameter"].iloc[0]))

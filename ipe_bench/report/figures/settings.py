@@ -27,7 +27,7 @@ _ALIKE = 0.05
 """Part by which the errors of estimators that are alike differ at most."""
 _MOST_ERROR = 1e4
 """Errors beyond are drawn here."""
-_WIDTH = 4.4
+_WIDTH = 4.2
 """Inches of the figure: its letters are read on a phone."""
 _LETTERS = 56
 """Length of a line above a row."""

@@ -17,6 +17,9 @@ NAMED = "name:"
 `data-name`."""
 Ends = tuple[float, float]
 """Ends of a column from the left, or of a row from above, in points."""
+LEAST_LETTERS = 10.0
+"""Pixels of the smallest letters of a panel on a phone, where wider ones are scrolled."""
+_SIZE = re.compile(r"font(?:-size)?: ([\d.]+)px")
 _MARGIN = 3.0
 """Points around a panel."""
 _WIDER = 0.04
@@ -53,7 +56,8 @@ def page_figure(figure: Figure, svg: str) -> str:
     grid = " ".join(f"minmax(0,{width:.0f}fr)" for width in widths)
     size = f"grid-template-columns:{grid};max-width:{sum(widths) / 60:.1f}in"
     legend = f'<div class="keys">{"".join(keys)}</div>'
-    return _classed(f'{legend}<div class="panels" style="{size}">{"".join(views)}</div>')
+    kind = "panels many" if len(widths) > 2 else "panels"
+    return _classed(f'{legend}<div class="{kind}" style="{size}">{"".join(views)}</div>')
 
 
 def _view(across: Ends, down: Ends, inside: str) -> str:
@@ -61,7 +65,15 @@ def _view(across: Ends, down: Ends, inside: str) -> str:
     left, right = across
     top, bottom = down
     box = f"{left:.1f} {top:.1f} {right - left:.1f} {bottom - top:.1f}"
-    return f'<svg viewBox="{box}">{inside}</svg>'
+    least = least_width(right - left, inside)
+    return f'<svg viewBox="{box}" style="--least:{least:.0f}px">{inside}</svg>'
+
+
+def least_width(width: float, svg: str) -> float:
+    """Returns the width in pixels from which on letters of a panel, `width` points wide, are large
+    enough."""
+    sizes = [float(size) for size in _SIZE.findall(svg)]
+    return width * LEAST_LETTERS / min(sizes) if sizes else 0.0
 
 
 def _cells(figure: Figure) -> dict[tuple[int, int], list[int]]:

@@ -29,6 +29,8 @@ def draw(view: View) -> Iterator[Drawing]:
     scale = rows["error_scale"].max()
     rows = rows[(rows["error_scale"] == scale) & (rows["parameter"] == ALL)]
     totals = view.totals[view.totals["error_scale"] == scale].set_index("estimator")
+    at, time = common.times(rows["at"])
+    rows = rows.assign(at=at)
     best_first = _best_first(rows, totals)
     shown = best_first[: common.most_panels() - 1]
     look = {label: view.look[label] for label in shown}
@@ -44,7 +46,7 @@ def draw(view: View) -> Iterator[Drawing]:
         _draw_errors(ax, rows[rows["estimator"] == label], look[label], ends)
         common.title(ax, f"{told[label]}{short[label]}")
     claiming = _draw_nees(axes[-1], rows, totals, look)
-    common.axis_labels(fig, "time [s]", f"error over {view.reference}")
+    common.axis_labels(fig, time, f"error over {view.reference}")
     axes[-1].set_ylabel("NEES / n")
     common.legend(fig, axes, look if claiming else None)
     hidden = [label for label in best_first if label not in shown]

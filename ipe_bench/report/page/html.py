@@ -93,6 +93,10 @@ def _asked(analysis: Analysis) -> list[str]:
     """States how many estimators, error scales and trials there are, and what is estimated from
     what."""
     totals = analysis.totals
+    if len(totals) and set(totals["noise"]) == {"certified"}:
+        problems = len(totals[analysis.setting_columns].drop_duplicates())
+        who = counted(totals["estimator"].nunique(), "estimator")
+        return [who, counted(problems, "problem")]
     numbers = []
     for column, noun in (("estimator", "estimator"), ("error_scale", "error scale")):
         if column in totals and len(totals):
@@ -100,7 +104,7 @@ def _asked(analysis: Analysis) -> list[str]:
     trials = sorted(set(totals["trials"])) if len(totals) else []
     if trials:
         each = " to ".join(f"{end:,}" for end in dict.fromkeys((trials[0], trials[-1])))
-        numbers.append(f"{each} trials each")
+        numbers.append(f"{each} {'trial' if trials[-1] == 1 else 'trials'} each")
     return [*numbers, *filter(None, [task(analysis.collection.groups)])]
 
 

@@ -16,7 +16,7 @@ from ipe_bench.report.tables.terminal import (
     overview_notes,
     statistics,
 )
-from ipe_bench.report.words import p_value, percent, short, value_text, varying
+from ipe_bench.report.words import enumerate_few, p_value, percent, short, value_text, varying
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_averages, certified_table, published_table
 from ipe_bench.statistics.collect import Collection
@@ -225,11 +225,15 @@ def endings(analysis: Analysis) -> Table | None:
     rows = analysis.endings
     if rows.empty:
         return None
-    columns = head(analysis, rows)
-    columns += _texts(rows, "estimator", "status")
-    columns += _counts(rows, "trials")
-    columns.append(column("share", rows["share"], percent))
-    columns += _texts(rows, "first", "message")
+    same = [name for name in rows.columns if name != "estimator"]
+    # What happened to several estimators alike stands once.
+    told = rows.groupby(same, sort=False, dropna=False)["estimator"].agg(list).reset_index()
+    told["estimator"] = told["estimator"].map(enumerate_few)
+    columns = head(analysis, told)
+    columns += _texts(told, "estimator", "status")
+    columns += _counts(told, "trials")
+    columns.append(column("share", told["share"], percent))
+    columns += _texts(told, "first", "message")
     caption = "Trials that did not converge, by reason, with the first example of each."
     return Table("endings", "Trials that did not converge", caption, columns, rows)
 

@@ -14,6 +14,7 @@ from ipe_bench.report.tables.matrix import opening
 from ipe_bench.report.tables.settings import PLAIN, Wording
 from ipe_bench.report.tables.table import (
     Column,
+    Legend,
     Part,
     Table,
     cells,
@@ -80,11 +81,11 @@ def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[st
     reference = "the linearised filter" if set(noises) == {"model"} else "the bound"
     failed = "" if narrow else _FAILED
     sign = _SIGNS if narrow else _SPELT_OUT
-    notes = [_LEGEND.format(failed=failed, reference=reference, sign=sign)]
+    notes: list[str] = [Legend(_LEGEND.format(failed=failed, reference=reference, sign=sign))]
     if "unknown" in noises:
         notes.append(_TOLD)
     if "model" in noises:
-        notes.append(TRACKED)
+        notes.append(Legend(TRACKED))
     return tuple(notes)
 
 
