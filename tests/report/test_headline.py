@@ -416,8 +416,9 @@ def test_states_that_move_have_words_of_their_own(tmp_path):
     later ones too."""
     model = ConstantVelocity(count=30, spread=3.0)
     table = ib.run(StateScenario(model), {"kf": ekf(), "rts": Smoother(ekf())}, 20, output=tmp_path)
-    kept, meaning = said(tmp_path)
+    kept, meaning, fact = said(tmp_path)
     assert meaning == MEANING
+    assert fact == "Tracks kept: kf 20 of 20, rts 20 of 20."
     assert kept == (
         "Too few trials to rank; kf and rts succeed in 100 % of 20 trials at error scale 1"
     )

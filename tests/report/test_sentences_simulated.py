@@ -432,6 +432,18 @@ def silent_failures(report: Report, match: Any) -> Iterator[tuple[str, str, bool
     yield "silent failures", COUNTS, wrong
 
 
+@sentence(r"Tracks kept: (?P<each>.*)\.", of_one=True)
+def tracks_kept(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
+    """Counts the trials that succeed, the most first."""
+    told = re.findall(r"(e\d+) (\d+) of (\d+)", match["each"])
+    found = [successes(report, 0, label) for label, _, _ in told]
+    counts = [(int(one.sum()), len(one)) for one in found]
+    wrong = counts != [(int(kept), int(trials)) for _, kept, trials in told]
+    everyone = [int(one.scalars["success"].sum()) for one in report.samples.values()]
+    most = sorted(everyone, reverse=True)[: len(told)]
+    yield "tracks kept", COUNTS, wrong or [kept for kept, _ in counts] != most
+
+
 # Entries of tables --------------------------------------------------------------------------------
 
 

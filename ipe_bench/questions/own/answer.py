@@ -27,6 +27,8 @@ _TOO_SMALL = 0.88
 estimate, this verdict is true of fresh data sets in nine of ten cases."""
 _TOO_LARGE = 0.75
 """Share of their width that would do, below which they are said to be too large."""
+_FAR = 100.0
+"""Factor from which on error bars are wrong by far."""
 _CHEAPER = 5.0
 """Factor of the cost from which it is named."""
 
@@ -41,8 +43,10 @@ def taken(own: Own, point: Point) -> Claim | None:
     and then the most robust. None: no estimator is ranked."""
     equal = _equal(own, point)
     right = [one for one in equal if _bars(one) == "about right"]
-    robust = [one for label in _ROBUST for one in right or equal if one.label == label]
-    return next(iter([*robust, *right, *equal]), None)
+    by_label = {one.label: one for one in right or equal}
+    robust = [by_label[label] for label in _ROBUST if label in by_label]
+    best_first = [*robust, *right, *equal]
+    return best_first[0] if best_first else None
 
 
 def _equal(own: Own, point: Point) -> list[Claim]:
@@ -50,7 +54,8 @@ def _equal(own: Own, point: Point) -> list[Claim]:
     the share."""
     claims = ranked(own, point)
     top = max((one.finds for one in claims), default=0.0)
-    slack = 2.0 * np.sqrt(max(top * (1.0 - top), 0.01) / own.trials)
+    variance = max(top * (1.0 - top), 0.01)
+    slack = 2.0 * np.sqrt(variance / own.trials)
     return [one for one in claims if one.finds >= top - slack]
 
 
@@ -72,7 +77,7 @@ def _bars_in_words(one: Claim) -> str:
     if verdict == "about right":
         return f"its error bars are about right ({share})"
     factor = one.factor if verdict == "too small" else 1.0 / one.factor
-    by = f" by about {factor:.2g}" if np.isfinite(factor) and factor < 100 else " by far"
+    by = f" by about {factor:.2g}" if factor < _FAR else " by far"
     return f"its error bars of {one.worst} are {verdict}{by} ({share})"
 
 
@@ -86,8 +91,9 @@ def _missing(own: Own, claims: Sequence[Claim]) -> str:
     lost = [one for one in claims if one.finds_between[1] < _MISSES]
     if not lost:
         return ""
-    first, *rest = [f"{one.label}{{}} in {_about(1 - one.finds)}" for one in lost]
-    said = [first.format(f" {_verb(own)}"), *(one.format("") for one in rest)]
+    first, *others = lost
+    said = [f"{first.label} {_verb(own)} in {_about(1 - first.finds)}"]
+    said += [f"{one.label} in {_about(1 - one.finds)}" for one in others]
     return ", ".join(said)
 
 
@@ -103,8 +109,7 @@ def advice(own: Own, point: Point) -> str:
     if best.finds_between[1] < _NONE:
         remedy = "mend the model's prior"
         if not own.moving:
-            at = ", ".join(f"{name} = {value:.4g}" for name, value in point.at.items())
-            remedy = f"start elsewhere, such as at {at}"
+            remedy = f"start elsewhere, such as at {point.words}"
         lost = f"{best.label} {_verb(own)} in {_about(1 - best.finds)}"
         return f"take none: from this start the best, {lost}; {remedy}"
     others = [one for one in ranked(own, point) if one is not best]
@@ -124,10 +129,10 @@ def sentences(own: Own) -> Iterator[str]:
     """Yields what else is to be said, the gravest first."""
     first, *others = own.points
     if others:
-        values = ", ".join(f"{name} = {value:.4g}" for name, value in others[0].at.items())
+        other = others[0]
         yield (
             f"BUT your data have {len(own.points)} answers that fit. Were the truth at the other,"
-            f" {values}: {advice(own, others[0])}."
+            f" {other.words}: {advice(own, other)}."
         )
     yield from _cheaper(own, first)
     told = list(_told_a_prior(own, first))
@@ -174,11 +179,9 @@ def own_parts(name: str, own: Own) -> Iterator[Part]:
 
 
 def _table(name: str, own: Own, point: Point, number: int) -> Table:
-    claims = [
-        *ranked(own, point),
-        *(one for one in point.claims if one not in ranked(own, point)),
-    ]
-    values = ", ".join(f"{key} = {value:.4g}" for key, value in point.at.items())
+    best_first = ranked(own, point)
+    claims = [*best_first, *(one for one in point.claims if one not in best_first)]
+    values = point.words
     where = f"logs that begin at {values}" if own.moving else f"truth {values}, noise {own.noise}"
     columns = [
         words("estimator", [one.label for one in claims]),

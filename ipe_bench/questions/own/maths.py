@@ -82,6 +82,11 @@ class Point:
     """Its parameters in their own units."""
     claims: Sequence[Claim]
 
+    @property
+    def words(self) -> str:
+        """Its parameters by name."""
+        return ", ".join(f"{name} = {value:.4g}" for name, value in self.at.items())
+
 
 @dataclass(frozen=True)
 class Own:

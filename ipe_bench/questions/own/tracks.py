@@ -14,7 +14,7 @@ from ipe_bench.questions.own.maths import Claim, Own, Point
 from ipe_bench.real.logs import Log, LogTracks
 from ipe_bench.real.profiles import CONFIDENCE, half_width
 from ipe_bench.states.auto import AutoTracker
-from ipe_bench.states.base import beginning_at
+from ipe_bench.states.base import Paths, beginning_at
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.paths import PathBlock, StateScenario, track_safely
 from ipe_bench.trials.scoring import Columns
@@ -42,12 +42,12 @@ def own_log(
         )
     scenario = StateScenario(log.model, seed)
     tracks, _ = track_safely(AutoTracker(), scenario.assumed, log.z[None])
-    start = np.reshape(tracks.start.mean, (-1, log.model.n))[0]
+    starts = np.reshape(tracks.start.mean, (-1, log.model.n))
+    start = starts[0]
     paths = beginning_at(log.model, start).draw(0, trials, seed)
-    missing = np.isnan(log.z)
-    from_start = PathBlock(scenario, 0, replace(paths, z=np.where(missing, np.nan, paths.z)))
+    from_start = PathBlock(scenario, 0, _missing_as_in(log, paths))
     drawn = scenario.draw(0, trials)
-    from_prior = PathBlock(scenario, 0, replace(drawn, z=np.where(missing, np.nan, drawn.z)))
+    from_prior = PathBlock(scenario, 0, _missing_as_in(log, drawn))
     claims = []
     for label, tracker in trackers.items():
         watch(label)
@@ -71,12 +71,16 @@ def own_log(
                 seconds=float(np.mean(estimates.seconds)),
             )
         )
-    sizes = [state.size for state in log.model.states]
-    values = {
-        state.name: float(value * size)
-        for state, value, size in zip(log.model.states, start, sizes, strict=True)
-    }
+    values = {}
+    for state, value in zip(log.model.states, start, strict=True):
+        values[state.name] = float(value * state.size)
     return Own(trials, [Point(values, claims)], "", True, {}, moving=True)
+
+
+def _missing_as_in(log: Log, paths: Paths) -> Paths:
+    """Returns paths with readings missing where the log has none."""
+    z = np.where(np.isnan(log.z), np.nan, paths.z)
+    return replace(paths, z=z)
 
 
 def _ratios(columns: Columns, names: list[str]) -> Array:

@@ -36,7 +36,8 @@ def draw(view: View) -> Iterator[Drawing]:
         return
     model: Any = scenario.measurement
     trials = scenario.draw(0, 1)
-    shown = picture(model, trials.z[0], model.simulate(trials.x)[0])
+    (exact,) = model.simulate(trials.x)
+    shown = picture(model, trials.z[0], exact)
     yield view.drawing(
         shown,
         NAME,
@@ -78,7 +79,9 @@ def picture(model: Gins, z: Array, h: Array) -> Any:
     fig, axes = common.panels(3, row=3)
     _draw_platform(axes[0], model)
     shape = (len(model.cases), len(model.times), 2)
-    velocities, errors, exact = (a.reshape(shape) for a in (model.offset + z, z, h))
+    velocities = np.reshape(model.offset + z, shape)
+    errors = z.reshape(shape)
+    exact = h.reshape(shape)
     minutes = model.times / 60
     for case, color in zip(range(len(model.cases)), _COLORS, strict=False):
         for axis, filled in ((0, color), (1, "white")):
@@ -95,8 +98,9 @@ def picture(model: Gins, z: Array, h: Array) -> Any:
 
 def _draw_platform(ax: Any, model: Gins) -> None:
     """Draws the platform from above with its axes, and the velocity that each case injects."""
-    corner = np.array([-1, 1, 1, -1, -1]) * _HALF
-    ax.plot(corner, np.roll(corner, 1)[[0, 1, 2, 3, 0]], color=BLACK, linewidth=1.2)
+    across = _HALF * np.array([-1, 1, 1, -1, -1])
+    up = _HALF * np.array([-1, -1, 1, 1, -1])
+    ax.plot(across, up, color=BLACK, linewidth=1.2)
     axis: Any = {"arrowstyle": "-|>", "color": SOFT, "linewidth": 0.9}
     letters: Any = {"color": SOFT, "fontsize": "small", "textcoords": "offset points"}
     ax.annotate("", (_REACH, 0.0), (0.0, 0.0), arrowprops=axis)

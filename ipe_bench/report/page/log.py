@@ -60,7 +60,7 @@ _OF_GATES = (
 _OF_CONSTANTS = (
     f"Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
     " the innovations, so only whiteness tests the model. Intervals of uncertain deviations are"
-    " those of the profile of the likelihood; of one that is held at 0, up to where it is 1.35"
+    " intervals of the profile of the likelihood; of one that is held at 0, up to where it is 1.35"
     " lower (95 %, one-sided)."
 )
 _STORED = (
