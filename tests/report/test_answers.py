@@ -4,6 +4,7 @@ curve's band is right."""
 from __future__ import annotations
 
 import hashlib
+import io
 import re
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -27,13 +28,14 @@ from ipe_bench.questions.compare.figure import _measure, _names, _outcome, _sign
 from ipe_bench.questions.design.answer import _draw_design, _findings, _ways
 from ipe_bench.questions.posterior.figure import draw_marginals
 from ipe_bench.questions.posterior.maths import Posterior, Reference
-from ipe_bench.report.figures.answers import draw_fit
+from ipe_bench.report.figures.answers import _drawn, _left_out, draw_fit
 from ipe_bench.report.figures.common import full_ticks, text
 from ipe_bench.report.figures.log import draw_log
 from ipe_bench.report.figures.views import looks_of, views
 from ipe_bench.report.page.answer import _drawings
 from ipe_bench.report.page.log import LogAnswer, _facts, _finding
 from ipe_bench.report.style import FACES, house_style
+from ipe_bench.report.tables.table import csv_text
 from ipe_bench.report.words import ends_in_percent, public, told_apart
 from ipe_bench.states import Smoother, Tracker, ekf, ukf
 from ipe_bench.states.base import widened
@@ -443,3 +445,30 @@ def test_a_track_that_overflows_is_drawn_as_far_as_it_goes(count):
     (line,) = [line for line in panels[0].lines if line.get_linestyle() == "-"]
     assert np.isfinite(line.get_ydata()).sum() == min(count, 20)
     assert found.table()["reading1_predicted"].isna().all()
+
+
+def test_a_csv_of_many_rows_reads_as_one_of_few():
+    rng = np.random.default_rng(0)
+    rows = 100_001
+    frame = pd.DataFrame(
+        {
+            "estimator": np.where(np.arange(rows) % 2, 'a,"b"', "=c"),
+            "x": rng.standard_normal(rows) * 10.0 ** rng.integers(-30, 30, rows),
+            "gap": np.where(np.arange(rows) % 3, np.nan, 2.0),
+            "k": np.arange(rows),
+            "good": np.arange(rows) % 5 == 0,
+        }
+    )
+    many = pd.read_csv(io.StringIO(csv_text(frame)))
+    expected = pd.read_csv(
+        io.StringIO(csv_text(frame[:1000]) + csv_text(frame[1000:]).partition("\n")[2]),
+    )
+    assert many["x"].to_numpy() == pytest.approx(frame["x"].to_numpy(), rel=1e-15, abs=0)
+    pd.testing.assert_frame_equal(many, expected, check_dtype=False)
+
+
+def test_of_many_readings_some_are_drawn_and_the_caption_says_which():
+    assert _drawn(20_000).all()
+    assert _left_out(20_000) == ""
+    assert _drawn(50_000).sum() == 16_667
+    assert "Drawn: 1 of 3 of 50,000 readings" in _left_out(50_000)

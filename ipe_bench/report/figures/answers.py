@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.measurements.base import labels, with_unit
 from ipe_bench.real.profiles import CONFIDENCE, half_width
 from ipe_bench.real.residuals import LEAST_P
@@ -29,6 +29,8 @@ MOST_ESTIMATORS = 12
 """Estimators with a panel of residuals; `residuals.csv` has all."""
 _MANY = 5000
 """Points from which on they are pixels in the PDF, too."""
+_MOST_POINTS = 20_000
+"""Readings beyond which not all are drawn."""
 _BENT = 30.0
 """Normalised residuals beyond this are drawn on a logarithmic axis: a model that does not fit at
 all."""
@@ -66,7 +68,8 @@ def draw_fit(found: Examination, z: Array, fit: Fit, look: Look) -> Iterator[Dra
     ax.fill_between(at, fitted - half, fitted + half, color=look.color, **band)
     ax.plot(at, fitted, color=look.color, label=common.text(found.label))
     style: Any = {"color": BOUND_COLOR, "markersize": 3.5, "rasterized": len(x) > _MANY}
-    ax.plot(x, z, "o", label="readings", zorder=3, **style)
+    kept = _drawn(len(x))
+    ax.plot(x[kept], z[kept], "o", label="readings", zorder=3, **style)
     ax.set_xlabel(common.text(name))
     ax.set_ylabel(common.text(with_unit(model.reading_name, model.reading_unit)))
     _residual_panel(beside, x.astype(float), fit, fit.outlier_limit, look.color)
@@ -76,7 +79,7 @@ def draw_fit(found: Examination, z: Array, fit: Fit, look: Look) -> Iterator[Dra
     common.legend(fig, [ax, beside])
     caption = (
         "Pointwise 95 % band, first order in the errors. Residuals are standard normal if model and"
-        " noise are right."
+        f" noise are right.{_left_out(len(x))}"
     )
     yield Drawing("fit", "Readings and fitted curve", caption, fig)
 
@@ -126,6 +129,7 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
     further = len(groups) - len(shown)
     if further:
         caption += f" {further} further panels: see residuals.csv."
+    caption += _left_out(len(x))
     yield Drawing("residuals", "Residuals in standard deviations", caption, fig)
 
 
@@ -146,6 +150,22 @@ def _alike(fits: Sequence[Fit]) -> list[list[Fit]]:
     return groups
 
 
+def _step(m: int) -> int:
+    """Returns k, of m readings of which every k-th is drawn."""
+    return -(-m // _MOST_POINTS)
+
+
+def _drawn(m: int) -> Mask:
+    """Tells which of m readings (m,) are drawn: more are one surface of colour."""
+    return np.arange(m) % _step(m) == 0
+
+
+def _left_out(m: int) -> str:
+    if _step(m) == 1:
+        return ""
+    return f" Drawn: 1 of {_step(m)} of {m:,} readings, and every outlier of the residuals."
+
+
 def _residual_panel(ax: Any, x: Array, fit: Fit, limit: float, color: str) -> None:
     """Draws the residuals of a fit over x (m,), outliers as crosses."""
     import seaborn as sns
@@ -155,7 +175,7 @@ def _residual_panel(ax: Any, x: Array, fit: Fit, limit: float, color: str) -> No
     ax.axhline(0.0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
     common.bound_line(ax, limit, "limit for outliers")
     common.bound_line(ax, -limit, "")
-    good = np.isfinite(r) & ~fit.outliers
+    good = np.isfinite(r) & ~fit.outliers & _drawn(len(x))
     points: dict[str, Any] = {"color": color, "legend": False, "ax": ax}
     many: Any = {"s": 9 if len(x) > 100 else 20, "rasterized": len(x) > _MANY}
     sns.scatterplot(x=x[good], y=r[good], alpha=0.75, linewidth=0, **many, **points)
