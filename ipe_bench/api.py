@@ -136,7 +136,8 @@ def load(directories: Directories) -> pd.DataFrame:
     Returns:
         A row per trial and estimator: measurement, noise, prior, error_scale, seed, estimator, and
         every key of the config that differs; trial, status, success, solved, `error_NAME`,
-        `crlb_distance` (the squared Mahalanobis distance by the bound at the truth), nees, fit_p,
+        `crlb_distance` (the squared Mahalanobis distance by the bound at the truth, of a folded
+        scalar state by its exact posterior), nees, fit_p,
         iterations, simulations, jacobians, time_s, message, the truth `x_NAME`, `deviation_NAME` as
         the estimator reports it, the bounds `crlb_NAME` and `bayes_NAME`, in multiples of the
         parameters' sizes; columns that only some rows have come last. A warning names what is

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import gather, put, take
-from ipe_bench.basics.linalg import Array, Mask
+from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother
-from ipe_bench.states.folds import calls, folded
-from ipe_bench.states.grid import Grid
+from ipe_bench.states.folds import calls, exact_tracks, grid_of, may_fold
 from ipe_bench.states.linearisation import Taylor, Unscented
 from ipe_bench.states.mirrored import in_first_turn, mirrored, ordered, with_second
 from ipe_bench.states.trackers import Filter, Tracker, Tracks, passed, smoothed
@@ -28,9 +27,6 @@ MIRRORED = 4
 AGAIN = 5
 """The stages, as the column `extra_stage` names them: the mirrored start answers after the rounds
 of restarts, of which the second one is 6, and so on."""
-
-_POINTS = 200
-"""Points of the grid of an epoch at least."""
 
 
 @dataclass(frozen=True)
@@ -66,27 +62,38 @@ class AutoTracker(Tracker):
 
     def hindrance(self, model: StateModel) -> str | None:
         why = Filter().hindrance(model)
-        return why if why and _grid(model) is None else None
+        return why if why and grid_of(model) is None else None
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         tracks, first = passed(model, z, Taylor())
-        if model.n > 1 or any(model.state_periods):
+        if may_fold(model):
+            tracks.calls += calls(model)
+        exact, rows = exact_tracks(model, z, first)
+        if not rows.size:
             return self._by_paths(model, z, tracks, first)
-        tracks.calls += calls(model)
-        first.calls += calls(model)
-        by_mean = Filter().hindrance(model) is None
-        exact = np.flatnonzero(folded(model, first) | (not by_mean))
-        grid = _grid(model) if exact.size else None
-        if grid is None:
-            return self._by_paths(model, z, tracks, first)
-        found, known = _exact(grid, model, z[exact])
-        found.calls += tracks.calls[exact]
-        parts = [(exact[known], take(found, known))]
-        others = np.setdiff1d(np.arange(len(z)), exact[known])
+        parts = [(rows, self._told(model, exact, tracks.calls[rows]))]
+        others = np.setdiff1d(np.arange(len(z)), rows)
         if others.size:
             begun = take(tracks, others), take(first, others)
             parts.append((others, self._by_paths(model, z[others], *begun)))
         return gather(parts)
+
+    def _told(self, model: StateModel, exact: Tracks, begun: Array) -> Tracks:
+        """Returns what the smoother of a grid says of trials, after so many calls (trials,)."""
+        trials = len(begun)
+        tracks = Tracks.empty(model, trials)
+        tracks.mean = exact.mean
+        tracks.covariance = exact.covariance
+        tracks.calls = begun + exact.calls
+        tracks.cost = exact.nis.sum(axis=1)
+        tracks.stage = np.full(trials, EXACT)
+        if not (model.gain_by_state or model.R_by_state):
+            tracks.status = np.full(trials, Status.CONVERGED, np.int8)
+            tracks.iterations = np.full(trials, model.epochs)
+            # The moments of the density count all its paths.
+            tracks.other = exact.mean
+            tracks.other_p = np.full(trials, np.nan)
+        return tracks
 
     def _by_paths(self, model: StateModel, z: Array, tracks: Tracks, first: Tracks) -> Tracks:
         """Tracks by paths of largest density, from the smoothed tracks of the first filter."""
@@ -146,35 +153,3 @@ class AutoTracker(Tracker):
         for mine, its in zip(tracks.start, other.start, strict=True):
             mine[rows] = its[likelier]
         return tracks
-
-
-def _grid(model: StateModel) -> Grid | None:
-    """Returns the grid that is exact for a model; None if none is."""
-    grid = Grid(_POINTS, smooths=True).fitting(model)
-    return grid if isinstance(grid, Grid) else None
-
-
-def _exact(grid: Grid, model: StateModel, z: Array) -> tuple[Tracks, Mask]:
-    """Returns what the smoother of a grid says of trials, and of which (trials,) it says
-    anything."""
-    try:
-        exact = grid.track(model, z)
-    except ArithmeticError:
-        if len(z) == 1:
-            return Tracks.lost(model, 1), np.zeros(1, dtype=bool)
-        halves = [_exact(grid, model, half) for half in np.array_split(z, 2)]
-        found, known = zip(*halves, strict=True)
-        return Tracks.join(found), np.concatenate(known)
-    tracks = Tracks.empty(model, len(z))
-    tracks.mean = exact.mean
-    tracks.covariance = exact.covariance
-    tracks.calls = exact.calls
-    tracks.cost = exact.nis.sum(axis=1)
-    tracks.stage = np.full(len(z), EXACT)
-    if not (model.gain_by_state or model.R_by_state):
-        tracks.status = np.full(len(z), Status.CONVERGED, np.int8)
-        tracks.iterations = np.full(len(z), model.epochs)
-        # The moments of the density count all its paths.
-        tracks.other = exact.mean
-        tracks.other_p = np.full(len(z), np.nan)
-    return tracks, np.ones(len(z), dtype=bool)

@@ -1,14 +1,17 @@
-"""Tells where a filter by tangents misleads itself: among the states that it predicts a reading
-turns back, hardly rises any more, or has other noise."""
+"""Tells where a filter by tangents misleads itself, since a reading turns back among the states
+that it predicts, hardly rises any more, or has other noise; the exact density is known there."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ipe_bench.basics.batches import take
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.states.base import StateModel
+from ipe_bench.states.grid import Grid
 from ipe_bench.states.smoothers import whole
-from ipe_bench.states.trackers import Tracks
+from ipe_bench.states.trackers import Filter, Tracks
 
 _AMONG = np.linspace(-2.0, 2.0, 5)
 """Where readings are looked at, in standard deviations of what is predicted."""
@@ -19,6 +22,49 @@ _SEEN = 1.0
 """Standard deviations of a reading that its steepest rise is at least, if it tells of the state."""
 _NOISES = 3.0
 """How many times the least standard deviation of a reading at these points the largest may be."""
+_POINTS = 200
+"""Points of the grid of an epoch at least."""
+
+
+def may_fold(model: StateModel) -> bool:
+    """Tells whether a model has a scalar state, which has no period."""
+    return model.n == 1 and not any(model.state_periods)
+
+
+def exact_tracks(
+    model: StateModel, z: Array, filtered: Tracks, smooths: bool = True
+) -> tuple[Tracks, NDArray[np.intp]]:
+    """Returns the tracks of a grid of those trials whose readings are folded among the states that
+    the extended filter predicts, if a grid is exact for them, and which trials these are."""
+    if not may_fold(model):
+        return Tracks.empty(model, 0), np.arange(0)
+    is_open = folded(model, filtered)
+    if Filter().hindrance(model):
+        # A filter takes nothing from such readings.
+        is_open[:] = True
+    rows = np.flatnonzero(is_open)
+    grid = grid_of(model, smooths) if rows.size else None
+    if grid is None:
+        return Tracks.empty(model, 0), np.arange(0)
+    tracks = _tracked(grid, model, z[rows])
+    known = np.flatnonzero(np.isfinite(tracks.mean).all(axis=(1, 2)))
+    return take(tracks, known), rows[known]
+
+
+def grid_of(model: StateModel, smooths: bool = True) -> Grid | None:
+    """Returns the grid that is exact for a model; None if none is."""
+    grid = Grid(_POINTS, smooths).fitting(model)
+    return grid if isinstance(grid, Grid) else None
+
+
+def _tracked(grid: Grid, model: StateModel, z: Array) -> Tracks:
+    """Tracks trials by a grid; NaN of those that it has no answer for."""
+    try:
+        return grid.track(model, z)
+    except ArithmeticError:
+        if len(z) == 1:
+            return Tracks.lost(model, 1)
+    return Tracks.join([_tracked(grid, model, half) for half in np.array_split(z, 2)])
 
 
 def folded(model: StateModel, filtered: Tracks) -> Mask:

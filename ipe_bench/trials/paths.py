@@ -11,13 +11,13 @@ import base64
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ipe_bench.basics.batches import take
+from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, plain_numbers, read_only
 from ipe_bench.basics.options import in_lines
@@ -30,11 +30,13 @@ from ipe_bench.states.algebra import half
 from ipe_bench.states.base import Paths, StateModel, require_sound, widened
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.copies import SURE, copy_p
+from ipe_bench.states.folds import exact_tracks, may_fold
 from ipe_bench.states.formulas import RecordedFormulas
+from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.lost import why_lost
 from ipe_bench.states.redone import unchanged
 from ipe_bench.states.smoothers import path_p
-from ipe_bench.states.trackers import Tracker, Tracks
+from ipe_bench.states.trackers import Tracker, Tracks, filtered
 from ipe_bench.trials.one_track import COLUMN, first_tracks, texts
 from ipe_bench.trials.scenario import Scenario, check_seed
 from ipe_bench.trials.scoring import Block, Columns, by_parameter, nees
@@ -121,6 +123,7 @@ class PathBlock:
     scenario: StateScenario
     start: int
     paths: Paths
+    _gates: dict[bool, Array] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def draw(cls, scenario: StateScenario, start: int, stop: int) -> PathBlock:
@@ -157,6 +160,24 @@ class PathBlock:
         """Those (trials, K, n) of the smoother that is linearised at the truth."""
         P = self._bound(smooths=True)
         return np.ascontiguousarray(np.diagonal(P, axis1=2, axis2=3))
+
+    def gates(self, smooths: bool) -> Array:
+        """The variances (trials, K, n) against which errors are held: of each trial's exact
+        posterior where the reading of a scalar state is folded, which no linear bound describes,
+        else of the bound."""
+        if smooths not in self._gates:
+            self._gates[smooths] = self._gates_of(smooths)
+        return self._gates[smooths]
+
+    def _gates_of(self, smooths: bool) -> Array:
+        bound = self.smoothed_variances if smooths else self.variances
+        model = self.scenario.assumed
+        if not may_fold(model):
+            return bound
+        z = self.paths.z
+        with np.errstate(all="ignore"):
+            exact, rows = exact_tracks(model, z, filtered(model, z, Taylor()), smooths)
+        return put(bound, rows, exact.covariance[..., 0])
 
     @cached_property
     def definite(self) -> Mask:
@@ -218,13 +239,19 @@ class PathBlock:
         elapsed = time.perf_counter() - began
         seconds = np.full(len(self), elapsed / max(1, len(self)))
         with np.errstate(all="ignore"):
-            return self._scored(tracks, messages, seconds, variances)
+            return self._scored(tracks, messages, seconds, variances, self.gates(tracker.smooths))
 
     def _scored(
-        self, tracks: Tracks, messages: dict[int, str], seconds: Array, variances: Array
+        self,
+        tracks: Tracks,
+        messages: dict[int, str],
+        seconds: Array,
+        variances: Array,
+        gates: Array,
     ) -> tuple[Estimates, Columns]:
         """The tracks as estimates of the last epoch, with what is stored of each trial; `variances`
-        (trials, K, n) are those of the bound over the path."""
+        (trials, K, n) are those of the bound over the path, `gates` those that errors are held
+        against."""
         at = self.scenario.scored
         x = self.paths.x
         e = self.scenario.assumed.nearest_state(tracks.mean, x) - x
@@ -240,9 +267,9 @@ class PathBlock:
         each = nees(e.reshape(-1, n), P.reshape(-1, n, n)).reshape(trials, K)
         each[~self.definite] = np.nan
         # A track with a gap is no answer, in whatever counts by its distance.
-        distance = np.where(finished, self._distance(e[:, -1]), np.nan)
-        # Squared errors over the bound's variances, where the model leaves any.
-        normalised = np.sum(np.where(variances > 0, e**2 / variances, 0.0), axis=2)
+        distance = np.where(finished, self._distance(e[:, -1], gates[:, -1]), np.nan)
+        # Squared errors over the variances, where the model leaves any.
+        normalised = np.sum(np.where(gates > 0, e**2 / gates, 0.0), axis=2)
         over_filter = _over(e**2, self.variances)
         columns = {
             "trial": np.arange(self.start, self.start + len(self)),
@@ -295,8 +322,11 @@ class PathBlock:
             texts[i] = base64.b64encode(errors[i].astype("<f4").tobytes()).decode()
         return texts
 
-    def _distance(self, e: Array) -> Array:
-        """Squared errors (trials,) of the last epoch in the metric of the bound at the truth."""
+    def _distance(self, e: Array, gates: Array) -> Array:
+        """Squared errors (trials,) of the last epoch in the metric of the bound at the truth, or of
+        the gate (trials, 1) of a scalar state."""
+        if may_fold(self.scenario.assumed):
+            return e[:, 0] ** 2 / gates[:, 0]
         white = half(self.bound[:, -1]).whitened(e[:, None])[:, 0]
         return np.sum(white**2, axis=1)
 

@@ -17,6 +17,8 @@ from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import options
 from ipe_bench.states import (
     Cubature,
+    Formulas,
+    Grid,
     IteratedSmoother,
     LevenbergMarquardtSmoother,
     Normal,
@@ -31,6 +33,7 @@ from ipe_bench.states.smoothers import path_p, whole
 from ipe_bench.states.trackers import Tracks, filtered
 from ipe_bench.states.whole_paths import PathDensity
 from ipe_bench.trials.paths import PathBlock, StateScenario
+from ipe_bench.trials.thresholds import gate
 
 NEAR = Pendulum(count=25, start=(1.0, 0.0), spread=0.2)
 LINEAR = ConstantVelocity(count=12, spread=2.0)
@@ -325,3 +328,36 @@ def test_a_path_that_has_arrived_waits_for_the_others(rule):
         np.testing.assert_array_equal(alone.mean[0], together.mean[trial])
         np.testing.assert_array_equal(alone.covariance[0], together.covariance[trial])
         assert alone.calls[0] == together.calls[trial]
+
+
+SQUARE = Formulas(
+    next={"x": "0.95*x + w"},
+    readings={"z": "x**2"},
+    noise={"w": 0.3},
+    deviation={"z": 0.3},
+    start={"x": 0.5},
+    spread={"x": 1.0},
+    count=12,
+)
+EVEN = replace(SQUARE, readings={"z": "x"})
+
+
+@pytest.mark.parametrize("smooths", [False, True])
+def test_errors_of_a_folded_scalar_state_are_held_against_its_exact_posterior(smooths):
+    block = PathBlock.draw(StateScenario(SQUARE), 0, 40)
+    exact = Grid(500, smooths).track(SQUARE, block.paths.z)
+    np.testing.assert_allclose(block.gates(smooths), exact.covariance[..., 0], rtol=1e-4)
+    # By the linear bound the exact answer loses trials, where the state is next to the fold.
+    assert (block.estimate(Grid(500, smooths))[1]["success"]).all()
+    linear = (exact.mean - block.paths.x)[:, -1] ** 2 / block.variances[:, -1]
+    assert (linear > gate(1)).any()
+    columns = block.estimate(ekf())[1]
+    error = columns["error_x"] ** 2 / exact.covariance[:, -1, 0, 0]
+    np.testing.assert_allclose(columns["crlb_distance"], error, rtol=1e-3)
+    np.testing.assert_array_equal(columns["success"], error <= gate(1))
+
+
+def test_errors_of_an_even_scalar_state_are_held_against_the_bound():
+    block = PathBlock.draw(StateScenario(EVEN), 0, 5)
+    np.testing.assert_array_equal(block.gates(False), block.variances)
+    np.testing.assert_array_equal(block.gates(True), block.smoothed_variances)

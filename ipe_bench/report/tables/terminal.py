@@ -68,7 +68,8 @@ _TOLD = (
 TRACKED = (
     "All columns are for the last epoch, where filters and smoothers have the same readings."
     " Success: the error lies in the gate (all but one in a million) of a filter"
-    " linearised at the true path. For whole paths see the table of all epochs. Cost: evaluations"
+    " linearised at the true path, or of the exact density where the reading of a single state"
+    " turns back. For whole paths see the table of all epochs. Cost: evaluations"
     " of transition and reading."
 )
 """References of a track's errors."""
