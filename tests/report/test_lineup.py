@@ -16,6 +16,7 @@ from ipe_bench.basics.files import own_conf
 from ipe_bench.report.finding import Finding
 from ipe_bench.statistics.records import family_of
 
+ROOT = Path(__file__).parents[2]
 EXPERIMENTS = own_conf() / "experiment"
 APART = {
     "paper": "the paper's two estimates, which its title counts",
@@ -59,6 +60,24 @@ def test_an_experiment_contains_the_strongest_of_each_family(path):
     assert set(best) >= {"IPE", "least squares", "filters"}
     assert compared(path) >= {best["least squares"], best["filters"]}
     assert compared(path) >= {"multistart", "map_lm", "iterated_ekf", "iplf"}
+
+
+def shown_runs(path: Path) -> list[str]:
+    """Returns the commands of a page that compare estimators or trackers, in one line each."""
+    text = path.read_text(encoding="utf-8").replace("\\\n", " ")
+    return re.findall(r"ipe-bench (run .*(?:solver|baseline|tracker)=\[.*)$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", ["README.md", "ipe_bench/report/docs/pages/first_hour.md"])
+def test_a_command_that_compares_contains_the_strongest_of_each_family(page):
+    best = strongest("headline", "family")
+    trackers = {*strongest("states", "given").values(), "iplf"}
+    shown = shown_runs(ROOT / page)
+    assert len(shown) >= 2
+    for words in shown:
+        named = set(re.findall(r"\w+", " ".join(re.findall(r"=\[([^\]]*)\]", words))))
+        wanted = trackers if "tracker=" in words else {best["least squares"], best["filters"]}
+        assert named >= wanted, words
 
 
 def test_a_title_with_only_names_its_field():
