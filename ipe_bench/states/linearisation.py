@@ -30,7 +30,7 @@ from ipe_bench.states.steps import plus
 _MOST_POINTS = 100_000
 """Points of a product rule at most."""
 _ROUND_OFF = 1e-14
-"""Variances, in parts of those of the values, that are round-off of a sum over points."""
+"""Part of a number that is round-off of a sum over points."""
 _FEW = 64
 """Points up to which NumPy is fast, and what they leave is a root of noise."""
 Function = Callable[[Array], Array]
@@ -70,10 +70,7 @@ class Linearised(NamedTuple):
         each = np.broadcast_to(N, (*self.y.shape, N.shape[-1]))
         if self.root is None:
             W = np.matmul(each, transposed(each)) + self.W
-            # Weights that are negative may leave round-off below 0.
-            size = np.sum(self.AF**2, axis=2)
-            none = np.abs(np.diagonal(W, axis1=1, axis2=2)) <= _ROUND_OFF * size
-            return half(np.where(none[:, None] | none[..., None], 0.0, W)).G
+            return half(W).G
         return np.concatenate([each, self.root], axis=2)
 
 
@@ -158,6 +155,12 @@ class SigmaPoints(Rule):
         M = np.matmul(c * d, s)
         left = d - np.matmul(M, s.T)
         W = np.matmul(c * left, transposed(left))
+        if (c < 0).any():
+            # A difference of squares may be round-off, below 0 too.
+            least = _ROUND_OFF * np.matmul(left**2, np.abs(c))
+            least += _ROUND_OFF**2 * np.abs(c).sum() * (np.sum(M**2, axis=2) + mean**2)
+            none = np.abs(np.diagonal(W, axis1=1, axis2=2)) <= least
+            W = np.where(none[:, None] | none[..., None], 0.0, W)
         # What is left is a root itself; of a negative weight there is none.
         root = None if (c < 0).any() else np.sqrt(c) * left
         return Linearised(mean, M, W, root)

@@ -117,14 +117,14 @@ def over(X: Rows, F: Rows) -> Rows:
     return out
 
 
-def root(W: Rows, sizes: Vector) -> Rows:
+def root(W: Rows) -> Rows:
     """Computes a triangular root of a covariance W by Cholesky's way, with columns of 0 where a
-    pivot is round-off beside the variance and a size; not a number if W is indefinite."""
+    pivot is round-off beside the variance; not a number if W is indefinite."""
     n = len(W)
     F = zeros(n, n)
     for j in range(n):
         square = W[j][j] - dot(F[j][:j], F[j][:j])
-        least = _SMALL * (np.maximum(W[j][j], 0.0) + sizes[j])
+        least = _SMALL * np.maximum(W[j][j], 0.0)
         some = np.less(least, square)
         none = np.less_equal(-least, square)
         length = np.sqrt(np.where(some, square, 1.0))
@@ -193,12 +193,22 @@ class Regression(NamedTuple):
             deviations = np.sqrt(self.c)
             return beside(N, [[*map(mul, deviations, row)] for row in left])
         # A negative weight leaves a difference, which has no root of its own.
+        left = [self._told(*given) for given in zip(left, linear.AF, linear.y, strict=True)]
         weighted = [[*map(mul, self.c, row)] for row in left]
         W = []
         for own, row in zip(N, weighted, strict=True):
             pairs = zip(N, left, strict=True)
             W.append([dot(own, noise, dot(row, other)) for noise, other in pairs])
-        return root(W, [dot(row, row) for row in linear.AF])
+        return root(W)
+
+    def _told(self, left: Vector, AF: Vector, y: Number) -> Vector:
+        """Returns what is left of a value, or 0 where that is round-off."""
+        squares = [a * a for a in left]
+        sizes = [abs(one) for one in self.c]
+        rounded = _SMALL**2 * sum(sizes) * dot(AF, AF, y * y)
+        least = _SMALL * dot(sizes, squares) + rounded
+        none = np.less_equal(np.abs(dot(self.c, squares)), least)
+        return [np.where(none, 0.0, a) for a in left]
 
 
 def predicted(linear: Linear, N: Rows, smooths: bool) -> tuple[State, Rows]:
