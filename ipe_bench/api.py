@@ -356,7 +356,7 @@ def estimate(
     find: str | Sequence[str] = (),
     examine: bool = True,
     progress: Shows = True,
-) -> Answer | LogAnswer:
+) -> Answer | LogAnswer | list[LogAnswer]:
     """Estimates parameters from real readings by every estimator, with standard errors, residuals
     and a test of fit.
 
@@ -364,8 +364,8 @@ def estimate(
         model: or a scenario, which states `noise`, `prior`, `error_scale`; or a state model, which
             takes none.
         readings: a CSV or Parquet file, several that share parameters, or an array z (m,) in the
-            model's order and unit, NaN if missing; None: those of the model. Of a state model one
-            log, a row per epoch, or (K, m).
+            model's order and unit, NaN if missing; None: those of the model. Of a state model a
+            log, a row per epoch, or (K, m), or several that are independent.
         estimators: by label; of a state model trackers. None: a few that suit most models.
         noise: states R. None: R is that of the file's column sigma, or of the model's own noise, or
             else one level is estimated from the residuals (`Unknown`), whose size then cannot test
@@ -386,7 +386,8 @@ def estimate(
     Returns:
         The sequence of the fits, each with its estimates by name in `values`, and `x` and
         `covariance` in the parameters' own units; of a state model a track of each (see
-        `ipe_bench.real.logs`). It shows itself in a notebook, and `table()` is a frame.
+        `ipe_bench.real.logs`), and of several logs a list of these. It shows itself in a notebook,
+        and `table()` is a frame.
 
     Raises:
         UserError: the readings are not this model's, or an estimator needs what is not given.
@@ -449,7 +450,7 @@ def _tracked(
     ignored: Sequence[str],
     find: str | Sequence[str],
     progress: Shows,
-) -> LogAnswer:
+) -> LogAnswer | list[LogAnswer]:
     from ipe_bench.plugins import standard
     from ipe_bench.real.logs import LogQuestion
     from ipe_bench.report.page.log import LogAnswer
@@ -458,7 +459,8 @@ def _tracked(
         choice = standard.OF_FILTERS if find else {"tracker": standard.of_run("tracker")}
         trackers = standard.constructed(choice)
     question = LogQuestion.of(model, readings, _labelled(trackers), ignored, find)
-    return LogAnswer.to(question, progress)
+    answers = LogAnswer.to(question, progress)
+    return answers[0] if len(answers) == 1 else answers
 
 
 def design(

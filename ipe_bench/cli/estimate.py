@@ -71,16 +71,18 @@ def _track(asked: Single, model: StateModel) -> int:
     }
     if spec.gate is not None:
         command["gate"] = spec.gate
-    log = question.log
-    files = [log.file] if log.file else []
-    provenance = _provenance(asked, files, [log.model, *question.trackers.values()])
+    files = [log.file for log in question.logs if log.file]
+    parts = [log.model for log in question.logs]
+    provenance = _provenance(asked, files, [*parts, *question.trackers.values()])
     drawn = spec.figures != "none"
     with asked.folder(NAME, command, [TABLE]) as folder:
-        answer = LogAnswer.to(question, "lines")
-        stored = store(folder, answer, command, provenance)
-    show(answer.parts())
-    say_files([stored, *write_page(folder, answer, provenance, figures=drawn)])
-    return 0 if answer.passes else 1
+        answers = LogAnswer.to(question, "lines")
+        stored = store(folder, answers, command, provenance)
+    for answer in answers:
+        show(answer.parts())
+    pages = [write_page(folder, answer, provenance, figures=drawn) for answer in answers]
+    say_files([stored, *(file for files in pages for file in files)])
+    return 0 if all(answer.passes for answer in answers) else 1
 
 
 def _provenance(

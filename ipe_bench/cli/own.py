@@ -89,7 +89,9 @@ def _of_log(asked: Single, files: list[str]) -> tuple[Own, AbstractContextManage
 
     spec = asked.spec
     trials = spec.trials or _LOGS
-    log = asked.log_question(files[0] if len(files) == 1 else tuple(files)).log
+    if len(files) > 1:
+        raise UserError(f"readings=[{','.join(files)}]: are several logs; name one")
+    (log,) = asked.log_question(files[0]).logs
     folder = _folder(
         asked,
         trials,

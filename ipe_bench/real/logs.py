@@ -565,9 +565,10 @@ def far_below(tracks: Sequence[LogTracks]) -> list[str]:
 
 @dataclass(frozen=True)
 class LogQuestion:
-    """Asks for the track of a log by each tracker, and for the constants `find` of its model."""
+    """Asks for the tracks of logs of a model by each tracker, and for the constants `find` that the
+    logs share."""
 
-    log: Log
+    logs: Sequence[Log]
     trackers: Mapping[str, Tracker]
     find: Sequence[str] = ()
 
@@ -581,31 +582,45 @@ class LogQuestion:
         find: str | Sequence[str] = (),
         gate: float | None = None,
     ) -> LogQuestion:
-        """Reads the log, and checks that every tracker can follow it.
+        """Reads a log, or several that are independent of each other, and checks that every tracker
+        can follow them.
 
         Raises:
             UserError: the readings are not this model's, or a tracker needs what is not given.
         """
-        if isinstance(readings, Sequence) and not isinstance(readings, str):
-            if len(readings) != 1:
-                raise UserError(
-                    f"readings=[{','.join(map(str, readings))}]: a track has one log; name one file"
-                )
-            (readings,) = readings
+        if not isinstance(readings, Sequence) or isinstance(readings, str):
+            readings = [readings]
+        _require_distinct(readings)
         if gate is not None:
             trackers = {label: _gated(label, one, gate) for label, one in trackers.items()}
         require_parts(model)
-        log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
-        validate([StateScenario(log.model)], trackers, 1, untried=[])
+        logs = []
+        for one in readings:
+            log = Log.of(model, Path(one) if isinstance(one, str) else one, ignored)
+            validate([StateScenario(log.model)], trackers, 1, untried=[])
+            logs.append(log)
         names = [find] if isinstance(find, str) else list(find)
         for label, tracker in trackers.items() if names else ():
-            require_likelihood(log, label, tracker)
-        return cls(log, trackers, names)
+            for log in logs:
+                require_likelihood(log, label, tracker)
+        return cls(logs, trackers, names)
 
-    def track(self, label: str, watch: Callable[[str], object] = str) -> LogTracks:
-        """Tracks the log by one tracker; `watch` is told how far a search is."""
-        one = (self.log, label, self.trackers[label])
-        return found_and_tracked(*one, self.find, watch) if self.find else LogTracks.of(*one)
+    def track(self, label: str, watch: Callable[[str], object] = str) -> list[LogTracks]:
+        """Tracks each log by one tracker; `watch` is told how far a search is."""
+        tracker = self.trackers[label]
+        if self.find:
+            return found_and_tracked(self.logs, label, tracker, self.find, watch)
+        return [LogTracks.of(log, label, tracker) for log in self.logs]
+
+
+def _require_distinct(readings: Sequence[Any]) -> None:
+    """Refuses no file, and one that is named twice."""
+    if not readings:
+        raise UserError("readings=[]: is empty; name a file")
+    files = [str(one) for one in readings if isinstance(one, str | Path)]
+    for file in files:
+        if files.count(file) > 1:
+            raise UserError(f"readings: {file} is given twice; name each file once")
 
 
 def _gated(label: str, tracker: Tracker, gate: float) -> Tracker:
@@ -638,19 +653,20 @@ def require_likelihood(log: Log, label: str, tracker: Tracker) -> None:
 
 
 def found_and_tracked(
-    log: Log,
+    logs: Sequence[Log],
     label: str,
     tracker: Tracker,
     find: Sequence[str],
     watch: Callable[[str], object] = str,
-) -> LogTracks:
-    """Finds the constants `find` under which a tracker finds the log most likely, and its track
-    with them; `watch` is told at each evaluation of the likelihood how far the search is.
+) -> list[LogTracks]:
+    """Finds the constants `find` under which a tracker finds independent logs of a model most
+    likely, and the track of each with them; `watch` is told at each evaluation of the likelihood
+    how far the search is.
 
     Raises:
         UserError: the model has no such constant.
     """
-    sought = _Sought.of(log.model, find)
+    sought = _Sought.of(logs[0].model, find)
 
     def cost(u: Array) -> float:
         """Computes minus the log likelihood; infinite where there is none."""
@@ -659,16 +675,21 @@ def found_and_tracked(
             return np.inf
         if not np.isfinite(sought.values(u)).all():
             return np.inf
-        try:
-            model = sought.near(u)
-        except UserError:
-            # A model in Python may take no 0.
-            return np.inf
-        if tracker.hindrance(model):
-            return np.inf
-        tracks, _ = track_safely(tracker, model, log.z[None])
-        value = -float(tracks.log_likelihood[0])
-        return value if tracks.degrees.any() and np.isfinite(value) else np.inf
+        total = 0.0
+        for log in logs:
+            try:
+                model = sought.near(log.model, u)
+            except UserError:
+                # A model in Python may take no 0.
+                return np.inf
+            if tracker.hindrance(model):
+                return np.inf
+            tracks, _ = track_safely(tracker, model, log.z[None])
+            value = -float(tracks.log_likelihood[0])
+            if not tracks.degrees.any() or not np.isfinite(value):
+                return np.inf
+            total += value
+        return total
 
     with np.errstate(invalid="ignore"), unchanged():
         best, *others = _minima(cost, sought.positive, watch)
@@ -678,9 +699,8 @@ def found_and_tracked(
             f" determine all of them; the search ended after {best.evaluations} evaluations at"
             f" {sought.written(best)}, and the track uses the model's own values"
         )
-        own = LogTracks.of(log, label, tracker)
-        return replace(own, message=message, found=NO_MAXIMUM, passes=False)
-    track = LogTracks.of(replace(log, model=sought.at(best.u)), label, tracker)
+        own = [LogTracks.of(log, label, tracker) for log in logs]
+        return [replace(one, message=message, found=NO_MAXIMUM, passes=False) for one in own]
     with np.errstate(invalid="ignore"), unchanged():
         found_constants = sought.constants(best, cost, watch)
     notes = [_at_zero_words(one) for one in found_constants if one.value == 0]
@@ -690,28 +710,35 @@ def found_and_tracked(
         for one in others
         if one.is_maximum
     ]
-    found = ""
-    message = track.message
-    if track.fit_p < FIT_LEVEL or track.white_p < FIT_LEVEL:
-        message = (
-            "find= ended at a maximum whose innovations do not fit (NIS: p ="
-            f" {track.fit_p:.2g}; white: p = {track.white_p:.2g}): the model does not describe the"
-            " log, and neither values nor errors can be trusted"
-        )
-    elif any(
+    several = any(
         one.is_maximum and one.cost - best.cost < _ALIKE and sought.is_beyond(found_constants, one)
         for one in others
-    ):
-        found = SEVERAL_MAXIMA
-        message = "several maxima fit the log almost equally well"
-    return replace(
-        track,
-        constants=found_constants,
-        notes=[*track.notes, *notes],
-        found=found,
-        message=message,
-        passes=track.passes and not found,
     )
+
+    def tracked(log: Log) -> LogTracks:
+        """Tracks a log with the constants."""
+        track = LogTracks.of(replace(log, model=sought.at(log.model, best.u)), label, tracker)
+        found = ""
+        message = track.message
+        if track.fit_p < FIT_LEVEL or track.white_p < FIT_LEVEL:
+            message = (
+                "find= ended at a maximum whose innovations do not fit (NIS: p ="
+                f" {track.fit_p:.2g}; white: p = {track.white_p:.2g}): the model does not describe"
+                " the log, and neither values nor errors can be trusted"
+            )
+        elif several:
+            found = SEVERAL_MAXIMA
+            message = "several maxima fit the log almost equally well"
+        return replace(
+            track,
+            constants=found_constants,
+            notes=[*track.notes, *notes],
+            found=found,
+            message=message,
+            passes=track.passes and not found,
+        )
+
+    return [tracked(log) for log in logs]
 
 
 def _at_zero_words(one: Constant) -> str:
@@ -766,13 +793,13 @@ class _Sought:
         values = zip(self.names, np.where(end.zero, 0.0, self.values(end.u)), strict=True)
         return ", ".join(f"{name}={value:.4g}" for name, value in values)
 
-    def at(self, u: Array) -> StateModel:
-        """Returns the model with the numbers at u."""
-        return replace(self.model, **self._options(u))  # type: ignore[type-var]
+    def at(self, model: StateModel, u: Array) -> StateModel:
+        """Returns the model of a log with the numbers at u."""
+        return replace(model, **self._options(u))  # type: ignore[type-var]
 
-    def near(self, u: Array) -> StateModel:
+    def near(self, model: StateModel, u: Array) -> StateModel:
         """Returns the same model, whose functions are not tried again."""
-        return self.model.with_numbers(self._options(u))
+        return model.with_numbers(self._options(u))
 
     def _options(self, u: Array) -> dict[str, Any]:
         parts: dict[str, Any] = {}

@@ -207,6 +207,7 @@ def test_without_trackers_they_are_those_of_the_command(monkeypatch, find):
 
     def note(log, label, tracker, *_):
         used[label] = tracker
+        return [None]
 
     monkeypatch.setattr(logs.LogTracks, "of", note)
     monkeypatch.setattr(logs, "found_and_tracked", note)

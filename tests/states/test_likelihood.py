@@ -248,6 +248,28 @@ def test_every_simulated_local_level_has_an_answer_of_largest_likelihood(logs, m
     assert (np.abs(held.mean(axis=0) - 0.95) < 4 * np.sqrt(0.95 * 0.05 / logs)).all()
 
 
+def test_several_logs_share_the_constants_that_are_likeliest_for_all():
+    """Those of the least sum of textbook costs; each log has its own length and track."""
+    g = np.random.default_rng(3)
+    logs = [np.cumsum(g.standard_normal(K)) + g.standard_normal(K) for K in (40, 25, 12)]
+    model = replace(LEVEL, spread={"level": 100.0}, noise={"w": 2.0}, deviation={"flow": 2.0})
+
+    def cost(u):
+        return sum(level_cost(*np.exp(u), z, 100.0) for z in logs)
+
+    own = minimize(cost, [0.0, 0.0], method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9})
+    question = tracks.LogQuestion(
+        [tracks.Log(replace(model, count=len(z)), z[:, None]) for z in logs], {"kf": ekf()}, BOTH
+    )
+    each = question.track("kf")
+    for one, z in zip(each, logs, strict=True):
+        assert_agrees([c.value for c in one.constants], np.exp(own.x), rtol=1e-3)
+        values = [c.value for c in one.constants]
+        assert one.log_likelihood == pytest.approx(-level_cost(*values, z, 100.0), abs=1e-8)
+        assert one.mean.shape == (len(z), 1)
+    assert sum(one.log_likelihood for one in each) == pytest.approx(-own.fun, abs=1e-5)
+
+
 @pytest.mark.slow
 def test_a_log_without_noise_has_none():
     x = 0.8 ** np.arange(1, 61)

@@ -432,8 +432,8 @@ def test_a_model_of_formulas_may_stand_in_a_file(tmp_path, estimate):
             "readings=gap.csv: row 3: is empty; if a reading is missing there, number the rows in",
         ),
         (
-            ["readings=[good.csv,more.csv]"],
-            "readings=[good.csv,more.csv]: a track has one log; name one file",
+            ["readings=[good.csv,good.csv]"],
+            "readings: good.csv is given twice; name each file once",
         ),
         (["readings=good.csv", "tracker=[nothing]"], "tracker=nothing: there is no such option"),
         (
@@ -528,3 +528,23 @@ def test_the_worst_epochs_of_a_log_are_named():
     (said,) = filtered.notes
     assert said.startswith("outliers, whose readings are further")
     assert f"epochs 31 (NIS {filtered.nis[30]:.3g}), 30 (NIS {filtered.nis[29]:.3g});" in said
+
+
+def test_each_of_several_logs_has_its_track_and_page(ipe_bench, tmp_path):
+    (tmp_path / "a.csv").write_text("z\n1\n2\n3\n")
+    (tmp_path / "b.csv").write_text("z\n5\n4\n")
+    model = "next.x=x+w readings.z=x noise.w=1 deviation.z=1 spread.x=5"
+    given = [f"state_model.{word}" for word in model.split()]
+    words = ["tracker=[ekf]", "readings=[a.csv,b.csv]", "figures=none", "output=out"]
+    code, out, _ = ipe_bench("estimate", "state_model=formulas", *given, *words)
+    assert code == 0
+    assert out.index("Log a") < out.index("Log b")
+    found = sorted(file.name for file in (tmp_path / "out").iterdir())
+    assert found == ["track-a.csv", "track-a.html", "track-b.csv", "track-b.html", "track.json"]
+    assert len((tmp_path / "out" / "track-b.csv").read_text().splitlines()) == 3
+    stored = json.loads((tmp_path / "out" / "track.json").read_text())
+    assert [*stored["logs"]] == ["a", "b"]
+    (_, alone, _) = ipe_bench(
+        "estimate", "state_model=formulas", *given, *words[:1], "readings=b.csv"
+    )
+    assert alone.split("last epoch")[1].split()[4:8] == out.split("last epoch")[2].split()[4:8]

@@ -40,7 +40,7 @@ _MANY = 5000
 """Points from which on they are pixels in the PDF, too."""
 
 
-def draw_log(log: Log, tracks: Sequence[LogTracks]) -> Iterator[Drawing]:
+def draw_log(log: Log, tracks: Sequence[LogTracks], name: str = "track") -> Iterator[Drawing]:
     """Draws the states, with the readings where a state is read, each other reading beside its
     prediction, and NIS of the first filter."""
     groups = _groups(tracks)[:MOST_TRACKS]
@@ -84,7 +84,7 @@ def draw_log(log: Log, tracks: Sequence[LogTracks]) -> Iterator[Drawing]:
         words.append(f"{model.n - len(states)} further states are in track.csv.")
     names = enumerate_few([_name(group) for group in groups])
     title = f"{names}: states ± {BAND:g} standard deviations"
-    yield Drawing("track", title, " ".join(words), fig)
+    yield Drawing(name, title, " ".join(words), fig)
 
 
 def _predicted(filters: Sequence[Sequence[LogTracks]]) -> list[int]:

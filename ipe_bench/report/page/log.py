@@ -76,15 +76,21 @@ class LogAnswer(Labelled[LogTracks]):
 
     log: Log
     tracks: Sequence[LogTracks]
+    name: str = ""
+    """Tells it from those of other logs of one question."""
 
     @classmethod
-    def to(cls, question: LogQuestion, progress: Shows = True) -> LogAnswer:
-        """Returns the answer to a question; `progress` is as in `ipe_bench.estimate`."""
+    def to(cls, question: LogQuestion, progress: Shows = True) -> list[LogAnswer]:
+        """Returns the answer to a question on each log; `progress` is as in
+        `ipe_bench.estimate`."""
         from ipe_bench.report.progress import counting
 
         labels = list(question.trackers)
         with counting("estimate", len(labels), progress) as begin:
-            return cls(question.log, [question.track(label, begin(label)) for label in labels])
+            each = [question.track(label, begin(label)) for label in labels]
+        logs = question.logs
+        tracks = zip(*each, strict=True)
+        return [cls(*one) for one in zip(logs, tracks, _names(logs), strict=True)]
 
     @property
     def passes(self) -> bool:
@@ -131,7 +137,9 @@ class LogAnswer(Labelled[LogTracks]):
             if text
         ]
         warnings = [Strong(text) for text in (*said, *far_below(self.tracks))]
-        return [*warnings, *self._constants(), self._innovations(), self._last_states()]
+        heading = [Strong(f"Log {self.name}")] if self.name else []
+        tables = [*self._constants(), self._innovations(), self._last_states()]
+        return [*heading, *warnings, *tables]
 
     def _innovations(self) -> Table:
         found = self.tracks
@@ -182,9 +190,24 @@ class LogAnswer(Labelled[LogTracks]):
         return [Table("constants", "Constants of largest likelihood", "", columns)]
 
 
-def store(folder: Path, answer: LogAnswer, command: Any, provenance: Mapping[str, Any]) -> Path:
-    """Writes track.json and returns its path."""
-    content = {"schema": SCHEMA, "command": command, "trackers": _trackers(answer), **provenance}
+def _names(logs: Sequence[Log]) -> list[str]:
+    """Names logs by their files, or by numbers where these are alike; empty if there is one."""
+    if len(logs) == 1:
+        return [""]
+    stems = [Path(log.file[0]).stem if log.file else "" for log in logs]
+    if len(set(stems)) < len(stems):
+        return [str(number) for number in range(1, len(logs) + 1)]
+    return stems
+
+
+def store(
+    folder: Path, answers: Sequence[LogAnswer], command: Any, provenance: Mapping[str, Any]
+) -> Path:
+    """Writes track.json and returns its path: what is said of each tracker, or of each log and
+    tracker."""
+    told: Any = {answer.name: _trackers(answer) for answer in answers}
+    said = {"logs": told} if len(answers) > 1 else {"trackers": told[""]}
+    content = {"schema": SCHEMA, "command": command, **said, **provenance}
     path = folder / f"{NAME}.json"
     write_json(path, content)
     return path
@@ -193,19 +216,22 @@ def store(folder: Path, answer: LogAnswer, command: Any, provenance: Mapping[str
 def write_page(
     folder: Path, answer: LogAnswer, provenance: Mapping[str, Any], *, figures: bool = True
 ) -> list[Path]:
-    """Writes track.csv, track.html and its pictures; returns the files."""
+    """Writes track.csv, track.html and its pictures, or track-NAME.csv and so on of one log of
+    several; returns the files."""
     from ipe_bench.report.figures.log import draw_log
 
     log = answer.log
     readings = int(np.isfinite(log.z).sum())
+    name = f"{NAME}-{answer.name}" if answer.name else NAME
+    of = f"{log.model.name}, {answer.name}" if answer.name else log.model.name
     return write_files(
         folder,
-        NAME,
-        (TABLE, answer.table()),
-        f"{log.model.name}: {_finding(answer)}",
+        name,
+        (f"{name}.csv", answer.table()),
+        f"{of}: {_finding(answer)}",
         _facts(answer),
         answer.parts(),
-        draw_log(log, answer.tracks) if figures else (),
+        draw_log(log, answer.tracks, name) if figures else (),
         lead=(
             "A model fits if innovations, readings less predictions, are as large as it says and do"
             " not resemble each other."
