@@ -16,6 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import make_docs as pages
+import notebooks
 import numpy as np
 import pandas as pd
 import pytest
@@ -577,6 +578,25 @@ def test_the_commands_of_the_first_hour_are_composed(command, hour):
     with session():
         jobs = jobs_of(given, multirun="-m" in command)
     assert len(jobs.specs) == (3 if "-m" in command else 1)
+
+
+@pytest.mark.parametrize("page", notebooks.NOTEBOOKS)
+def test_a_notebook_has_the_files_and_commands_of_its_page(page, tmp_path):
+    path = PAGES / f"{page}.md"
+    write_files(path, tmp_path)
+    made = notebooks.notebook(path.read_text(encoding="utf-8"))
+    cells = [cell["source"] for cell in made["cells"] if cell["cell_type"] == "code"]
+    written = [one.removeprefix("%%writefile ") for one in cells if one.startswith("%%writefile")]
+    files = dict(one.split("\n", 1) for one in written)
+    assert files == {
+        one.name: one.read_text(encoding="utf-8").strip("\n") for one in tmp_path.iterdir()
+    }
+    typed = "\n".join(cell for cell in cells if cell.startswith("!")).replace("\\\n", "")
+    lines = [shlex.split(line.removeprefix("!ipe-bench ")) for line in typed.splitlines()]
+    assert lines == commands(path)
+    text = "".join(cell["source"] for cell in made["cells"] if cell["cell_type"] == "markdown")
+    assert ".md)" not in text
+    assert "pictures/" not in text
 
 
 def test_the_drawings_of_words_show_what_their_page_says():

@@ -23,6 +23,7 @@ from typing import Any
 
 import pandas as pd
 from gallery_frames import SUFFIX, Computed, read
+from notebooks import write_notebooks
 from readme import PICTURES, write_readme
 from shared import oracles
 from state_tables import with_tables
@@ -60,6 +61,7 @@ SETTINGS = {
     "suppress_warnings": [
         "myst.xref_missing"
     ],  # of links to rows of checked.md, which tests/test_oracles.py follows
+    "exclude_patterns": ["notebooks"],  # to download, and no pages
     "nb_execution_mode": "force",
     "nb_execution_in_temp": True,
     "nb_execution_raise_on_error": True,
@@ -157,6 +159,7 @@ def build(output: Path, trials: int) -> int:
     print("reference pages ...", flush=True)
     write_reference(source / "reference")
     write_drawings(source)
+    write_notebooks(source)
     write_tables(source)
     write_gallery(source / "gallery", output / "results", trials)
     shutil.copyfile(PICTURES[0], source / "gallery" / "pictures" / "success.png")
