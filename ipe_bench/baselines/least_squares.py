@@ -344,7 +344,7 @@ class LeastSquares(Estimator):
         super().__post_init__()
         if self.method == "lm" and self.loss != "linear":
             raise UserError(
-                f"loss={self.loss}: method=lm knows loss=linear only; choose method=trf or dogbox"
+                f"loss={self.loss}: method=lm takes only loss=linear; choose method=trf or dogbox"
             )
 
     @property

@@ -15,7 +15,7 @@ class Status(IntEnum):
         return member
 
     RUNNING = -1, "not finished"
-    CONVERGED = 0, "the estimating equation holds within the tolerance"
+    CONVERGED = 0, "the estimating equation is solved within the tolerance"
     STALLED = 1, "steps became tiny before the equation was solved"
     MAX_ITERATIONS = 2, "the iteration limit was reached"
     DIVERGED = 3, "the iterate left the model's valid region"

@@ -104,5 +104,5 @@ def refuse_blanks(words: Sequence[str]) -> None:
         ):
             parts = words[i : i + 3] if second == "=" else (first, second)
             raise UserError(
-                f"{' '.join(parts)}: has a blank beside the equals sign; write {''.join(parts)}"
+                f"{' '.join(parts)}: has a blank next to the equals sign; write {''.join(parts)}"
             )

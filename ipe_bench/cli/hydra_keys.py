@@ -74,7 +74,7 @@ def _require_readable(path: Path) -> None:
     except yaml.YAMLError as error:
         raise UserError(explain_yaml(error, path)) from None
     if _size(root, {}) > _MOST_NODES:
-        raise UserError(f"{path}: stands for more than {_MOST_NODES} values; use fewer aliases")
+        raise UserError(f"{path}: expands to more than {_MOST_NODES} values; use fewer aliases")
 
 
 def _size(node: yaml.Node | None, known: dict[yaml.Node, float]) -> float:

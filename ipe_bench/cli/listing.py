@@ -159,4 +159,4 @@ def _describe_measurement(option: plugins.Option) -> None:
     if model.inputs:
         known = ", ".join(i.heading for i in model.inputs)
         say(f"A file's own {known} take the place of these; so it may have any number of rows.")
-    say("A column sigma, if there is one, holds the standard deviation of each reading.\n")
+    say("An optional column sigma has the standard deviation of each reading.\n")

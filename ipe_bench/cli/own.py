@@ -42,7 +42,7 @@ def own_command(short: Short) -> int:
     asked.words.refuse(_WITHOUT_MEANING, _REFUSED)
     trials = asked.spec.trials
     if trials is not None and trials < _FEWEST:
-        raise UserError(f"trials={trials}: are too few to know shares by; give at least {_FEWEST}")
+        raise UserError(f"trials={trials}: are too few to estimate shares; give at least {_FEWEST}")
     if asked.spec.state_model is None:
         found, folder = _of_constants(asked, short.readings)
     else:

@@ -181,7 +181,7 @@ def _there_already(jobs: Jobs) -> list[str]:
             there -= {cell.identity_key for cell in result_keys(job.scenario, job.estimators)}
         if there:
             held = f"{counted(len(there), 'result')} of other settings or older code"
-            lines.append(f"{output}: holds {held}; they stay beside the new")
+            lines.append(f"{output}: contains {held}; they are kept")
     name = jobs.words.chosen("name")
     own = jobs.words.chosen("experiment")
     if name != own and name in [option.name for option in options("experiment")]:

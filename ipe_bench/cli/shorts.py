@@ -159,9 +159,9 @@ def _require_pair(
         _refuse_bare_names(others)
         _refuse_no_model(files[0], others)
         raise UserError(
-            f"{files[0]}: holds readings, and no model is given; write a function's file, a formula"
-            f' in quotes or a YAML file before it: ipe-bench {command} "a*exp(-b*t)+c" {files[0]},'
-            " or choose measurement=NAME"
+            f"{files[0]}: contains readings, but no model is given; write a function's file, a"
+            " formula in quotes or a YAML file before it: ipe-bench"
+            f' {command} "a*exp(-b*t)+c" {files[0]}, or choose measurement=NAME'
         )
 
 

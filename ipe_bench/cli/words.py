@@ -196,7 +196,7 @@ def _from_file(group: str, name: str, word: str) -> list[str]:
     content = plugins.read_yaml_file(Path(name), word)
     if not isinstance(content, dict):
         example = "NAME: {nominal: 1}" if group == "parameters" else "rates, start, outputs"
-        raise UserError(f"{word}: holds no keys; write a YAML file of options such as {example}")
+        raise UserError(f"{word}: has no keys; write a YAML file of options such as {example}")
     if TARGET in content:
         raise UserError(f"{word}: has a {TARGET}; the model is chosen by {group}=, so leave it out")
     return options_of(group, content, word)
@@ -342,7 +342,7 @@ def _check_place(override: Override) -> None:
             f"{word}: goes nowhere; write +{group}@{plugins.PACKAGES[group]}.LABEL={name}"
         )
     elif not added:
-        raise UserError(f"{word}: a label of its own is added; write +{group}@{package}={name}")
+        raise UserError(f"{word}: another label is added; write +{group}@{package}={name}")
 
 
 def _check_choice(override: Override, groups: Groups) -> None:

@@ -245,7 +245,7 @@ class Formula(WrittenModel):
             )
         if self.reading in self.arithmetic.names:
             raise UserError(
-                f"reading={self.reading}: stands in the expression too; what is measured cannot"
+                f"reading={self.reading}: is also in the expression; what is measured cannot"
                 " explain it"
             )
         self.require_columns_and_parameters("own")
@@ -281,7 +281,7 @@ class Formula(WrittenModel):
                 value = graph.apply("add", self.arithmetic(known), 0.0)
                 by_parameter = slopes(value, map(known.__getitem__, self.start))
         except (ArithmeticError, ValueError, TypeError) as error:
-            numbers = "a part that is made of numbers alone has no real value"
+            numbers = "a part of only numbers has no real value"
             raise UserError(f"measurement.expression: {numbers} ({error})") from None
         inputs = list(known.values())
         return Program.of([value], inputs), Program.of(by_parameter, inputs)

@@ -315,7 +315,7 @@ def function(
     name = getattr(h, "__qualname__", "")
     if not name.isidentifier() or getattr(sys.modules.get(module), name, None) is not h:
         raise UserError(
-            f"{name or h!r}: give a function that stands in a module by its own name, not inside"
+            f"{name or h!r}: give a function that a module defines under its own name, not inside"
             " another"
         )
     return Function(of=f"{module}:{name}", start=start or {}, **options)

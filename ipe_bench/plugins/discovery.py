@@ -31,7 +31,7 @@ from ipe_bench.basics.files import own_conf, regular
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
 PACKAGES = {**dict.fromkeys(ESTIMATOR_GROUPS, "estimators"), "tracker": "trackers"}
-"""Groups of which several options are chosen, each under a label of its own, by the key that holds
+"""Groups of which several options are chosen, each under its own label, by the key that holds
 them."""
 COMPONENT_GROUPS = (
     "measurement",
@@ -220,7 +220,7 @@ class Option:
         except yaml.YAMLError as error:
             return explain_yaml(error, self.path)
         if not isinstance(config, dict):
-            return f"{self.path}: holds no keys; write KEY: VALUE lines"
+            return f"{self.path}: has no keys; write KEY: VALUE lines"
         return None
 
 
@@ -411,7 +411,7 @@ def options_in(folder: Path) -> list[Option]:
     _added[home] = None
     sources.cache_clear()
     if not list(_in_folder(home)):
-        raise UserError(f"{folder}: holds no package with a folder conf in it; see `ipe-bench new`")
+        raise UserError(f"{folder}: contains no package with a folder conf; see `ipe-bench new`")
     own = [o for o in options() if home in (*o.path.parents, *(o.rival.parents if o.rival else ()))]
     found = [option for option in own if option.group in CHECKED_GROUPS]
     if not found:

@@ -204,7 +204,7 @@ def _require_header(table: TextTable) -> None:
         )
     for name, count in Counter(table.heading).items():
         if count > 1:
-            what = f"column {name} stands there" if name else "columns without a name stand there"
+            what = f"column {name} is there" if name else "columns without a name are there"
             raise table.error(f"{what} twice; keep one")
 
 
@@ -212,7 +212,7 @@ def _wrong_length(table: TextTable, number: int, row: Sequence[str]) -> str:
     """Says why a row has more or fewer cells than the header, and what mends it."""
     first, _ = table.rows[0]
     if number == first and all(cell.strip() and table.number(cell) is None for cell in row):
-        return "looks like the header, which must be the first row; remove what stands above it"
+        return "looks like the header, which must be the first row; remove what is above it"
     remedy = _MISSING
     if len(row) > len(table.heading) and table.decimal == ".":
         remedy = "with decimal commas, separate the cells by semicolons"
@@ -410,8 +410,7 @@ def _require_order(table: TextTable, name: str, values: Sequence[Any]) -> None:
     for (text, where), label in zip(table.column(name), values, strict=True):
         if _label(text, table.number) != _label(str(label)):
             raise table.error(
-                f"{where}: '{text}' stands where the order of the rows says {label}; leave the"
-                " column out"
+                f"{where}: '{text}' is out of order, which says {label}; leave the column out"
             )
 
 
@@ -439,9 +438,7 @@ def _rows_of(table: TextTable, model: Measurement, also: Sequence[str]) -> list[
         if place in found:
             said = _said(model, [cell.strip() for cell in cells])
             earlier, _ = table.rows[found[place]]
-            raise table.error(
-                f"row {number}: {said} stands in row {earlier} already; keep one of them"
-            )
+            raise table.error(f"row {number}: {said} is in row {earlier} already; keep one of them")
         found[place] = k
     if len(found) < model.m:
         absent = next(label for i, label in enumerate(every) if i not in found)
@@ -481,9 +478,7 @@ def _reading_column(table: TextTable, model: Measurement) -> str:
     other = free[0] if len(free) == 1 else "COLUMN"
     remedy = f"set measurement.reading={other}" if hasattr(model, "reading") else f"rename {other}"
     there = ", ".join(table.heading)
-    raise table.error(
-        f"column {names[0]} is missing, which holds the readings; there are {there}; {remedy}"
-    )
+    raise table.error(f"column {names[0]} of the readings is missing; there are {there}; {remedy}")
 
 
 def _require_unit_of_angles(table: TextTable, heading: str, model: Measurement) -> None:

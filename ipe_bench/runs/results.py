@@ -216,7 +216,7 @@ class Results:
         self.runs += tuple(self._records(store.runs, RUN))
         self.attempts += self._records(store.failed, FAILED)
         if keys is None and not listed and not self.runs:
-            self.extra_problems.append(f"{store.directory}: holds no results of ipe-bench")
+            self.extra_problems.append(f"{store.directory}: contains no results of ipe-bench")
         if (self.outdated or self.moved) and not self.stored and keys is None:
             self.extra_problems.append(
                 f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}"

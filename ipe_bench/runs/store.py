@@ -354,6 +354,8 @@ def require_results(folders: Sequence[Path | str]) -> list[Path]:
     for folder in found:
         store = Store(folder)
         if not (store.runs.is_dir() or store.trials.is_dir()):
-            what = "holds no results of ipe-bench" if folder.exists() else "there is no such folder"
+            what = (
+                "contains no results of ipe-bench" if folder.exists() else "there is no such folder"
+            )
             raise UserError(f"{folder}: {what}; give the output folder of a run")
     return found

@@ -91,7 +91,7 @@ class Relinearized(Method[FrozenSystem, Round], Estimator):
         for option in fields(self.solver):
             if option.name in _ONLY_A_STEP and getattr(self.solver, option.name) != option.default:
                 raise UserError(
-                    f"solver.{option.name}: has no effect inside relinearized; set {option.name}"
+                    f"solver.{option.name}: has no effect in relinearized; set {option.name}"
                     " beside it"
                 )
 

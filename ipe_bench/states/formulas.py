@@ -424,9 +424,7 @@ def _check_group(key: str, formulas: Mapping[str, Arithmetic], names: set[str]) 
 def _check_noise(model: Formulas) -> None:
     for name in model.noise:
         if name not in model._named_by_next:
-            raise UserError(
-                f"noise.{name}: stands in no formula of next; add it to one, or leave it out"
-            )
+            raise UserError(f"noise.{name}: is in no formula of next; add it to one, or remove it")
 
 
 def _check_labels(model: Formulas) -> None:

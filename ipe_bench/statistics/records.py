@@ -78,7 +78,7 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "converged",
         "converged",
-        "Share of trials in which the estimating equation holds within the tolerance. The other"
+        "Share of trials in which the estimating equation is solved within the tolerance. The other"
         " endings have their own names and messages.",
         lambda s: f.share(s.converged),
         kind="share",

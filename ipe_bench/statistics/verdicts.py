@@ -76,7 +76,7 @@ VERDICTS = (
         UNDECIDED,
         "undecided",
         "?",
-        "A few trials carry the mean NEES, or it seems too small and rare large errors may be"
+        "A few trials dominate the mean NEES, or it seems too small and rare large errors may be"
         " missing.",
     ),
     Word(

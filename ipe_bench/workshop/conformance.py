@@ -481,7 +481,7 @@ def orders_its_epochs(model: Measurement) -> str | None:
     if model.epochs is None:
         return "it has no epochs"
     rows = np.sort(np.concatenate(model.epochs))
-    assert np.array_equal(rows, np.arange(model.m)), "the epochs do not hold every reading once"
+    assert np.array_equal(rows, np.arange(model.m)), "the epochs do not contain every reading once"
     x = _points(model)
     stop = max(1, len(model.epochs) // 2)
     whole = model.simulate(x)[:, model.rows(stop)]

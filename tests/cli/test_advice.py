@@ -149,7 +149,7 @@ ADVICE = [
         "run solver=[newton] objective=newton.{}",
     ),
     ("run solver=[] baseline=[]", r"choose with (solver=)", "run baseline=[] {}[newton]"),
-    ("run figures=some", r"one of \w+, (\w+)", "run figures={}"),
+    ("run figures=some", r"choose \w+, (\w+)", "run figures={}"),
     ("run formats=tiff", r"among .* and (\w+)", "run formats={}"),
     ("run tracker=[ekf]", r"goes with (\S+);", "run tracker=[ekf] {}", {"NAME": "growth"}),
     (

@@ -134,7 +134,7 @@ MISTAKES = {
     ),
     "a file without a model for run": (
         ["run", "my.csv"],
-        "my.csv: holds readings, and no model is given; write a function's file, a formula in"
+        "my.csv: contains readings, but no model is given; write a function's file, a formula in"
         ' quotes or a YAML file before it: ipe-bench run "a*exp(-b*t)+c" my.csv',
     ),
     "an option without its group": (
@@ -148,15 +148,15 @@ MISTAKES = {
     ),
     "a blank behind": (
         ["run", "error_scale=", "33"],
-        "has a blank beside the equals sign; write error_scale=33",
+        "has a blank next to the equals sign; write error_scale=33",
     ),
     "a blank before": (
         ["run", "error_scale", "=33"],
-        "has a blank beside the equals sign; write error_scale=33",
+        "has a blank next to the equals sign; write error_scale=33",
     ),
     "blanks about": (
         ["report", ".", "figures", "=", "none"],
-        "figures = none: has a blank beside the equals sign",
+        "figures = none: has a blank next to the equals sign",
     ),
     "an exponent": (
         ["run", "trials=1e3"],

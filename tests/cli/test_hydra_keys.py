@@ -254,8 +254,8 @@ BOMB = "a: &a [1,1,1,1,1,1,1,1,1,1]\n" + "".join(
     for old, new in zip("abcdefghi", "bcdefghij", strict=True)
 )
 FILES = {
-    "a bomb": (BOMB.encode(), "stands for more than 100000 values; use fewer aliases"),
-    "one within itself": (b"a: &a [*a]\n", "stands for more than 100000 values"),
+    "a bomb": (BOMB.encode(), "expands to more than 100000 values; use fewer aliases"),
+    "one within itself": (b"a: &a [*a]\n", "expands to more than 100000 values"),
     "a byte order mark": (b"\xef\xbb\xbf# @package _global_\r\n", "begins with a byte order mark"),
     "Latin-1": (b"# \xe9\ntrials: 3\n", "is not UTF-8; save it as UTF-8"),
     "brackets": (b"trials: " + 5000 * b"[" + 5000 * b"]", "is nested too deeply"),

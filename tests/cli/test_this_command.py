@@ -56,7 +56,7 @@ def test_a_folder_with_results_of_other_settings_is_said_to_hold_them(ipe_bench)
     assert "mixed: holds" not in ipe_bench("run", *words, "trials=8")[1]
     assert "mixed: holds" not in ipe_bench("run", "-m", *words, "trials=8", "error_scale=1,3")[1]
     _, out, _ = ipe_bench("run", *words, "trials=8", "seed=5")
-    assert "mixed: holds 2 results of other settings or older code; they stay beside the new" in out
+    assert "mixed: contains 2 results of other settings or older code; they are kept" in out
 
 
 def test_the_name_of_an_experiment_is_for_the_experiment(ipe_bench):

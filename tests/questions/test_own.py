@@ -127,7 +127,7 @@ def test_the_robust_one_is_taken_and_a_cheap_one_is_named_from_a_factor_of_five(
     found = Own(200, [Point({"a": 1.0}, claims)], "1", True, {})
     assert headline(found).startswith(
         "On 200 simulated data sets like yours: take auto; its error bars are about right (about"
-        " 95 % hold the truth); ekf misses the best fit in about 50 %"
+        " 95 % contain the truth); ekf misses the best fit in about 50 %"
     )
     assert not list(sentences(found))
     dear = replace(found, points=[Point({"a": 1.0}, [*claims[:1], claim("auto", 200, cost=26.0)])])

@@ -145,7 +145,7 @@ def test_columns_are_left_out_with_their_units_or_without(tmp_path):
         (ParameterInfo("b1_2", upper=200.0), (), r"parameters.b1_2: its start, 250, is not inside"),
         (None, ("u",), r"ignore_columns=u: there is no such column \(there are: sigma, t, y\)"),
         (None, ("t",), r"column t is missing"),
-        (None, ("y",), r"column y is missing, which holds the readings"),
+        (None, ("y",), r"column y of the readings is missing"),
     ],
 )
 def test_what_is_not_there_is_neither_known_nor_left_out(files, known, without, expected):

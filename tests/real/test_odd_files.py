@@ -128,7 +128,7 @@ REFUSED = {
     "time missing": (with_cell("t", ""), r"row 4, column t: is empty"),
     "rows numbered otherwise": (
         text("row,t,y,sigma", *(f"{i},{line}" for i, line in enumerate(GOOD[1:]))),
-        r"row 2, column row: '0' stands where the order of the rows says 1",
+        r"row 2, column row: '0' is out of order, which says 1",
     ),
     "empty": (b"", "is empty"),
     "a mark and nothing else": ("\ufeff".encode(), "is empty"),
@@ -178,10 +178,10 @@ REFUSED = {
         text(*(line + "," for line in GOOD)),
         "column 4, which has no name, is not",
     ),
-    "two columns of one name": (text("t,y,y", *GOOD[1:]), "column y stands there twice"),
+    "two columns of one name": (text("t,y,y", *GOOD[1:]), "column y is there twice"),
     "two columns without a name": (
         text("t,y,sigma,,", *(f"{line},," for line in GOOD[1:])),
-        "without a name stand",
+        "without a name are there",
     ),
     "weight": (text("t,y,weight", *GOOD[1:]), "column weight is not understood; remove it"),
     "a note": (text("t,y,note", *(f"{t},{y},fine" for t, y, _ in ROWS)), "column note is not"),
@@ -193,7 +193,7 @@ REFUSED = {
     ),
     "Y": (
         text("t,Y,sigma", *GOOD[1:]),
-        "column y is missing, .* there are t, Y, sigma; set measurement.read",
+        "column y of the readings is missing; there are t, Y, sigma; set measurement.read",
     ),
     "x": (text("x,y,sigma", *GOOD[1:]), "column t is missing.*If t is a parameter"),
     "another unit of sigma": (
@@ -294,7 +294,7 @@ MISTAKEN = (
         "a beacon twice",
         Ranging(),
         lambda r: [*r, r[1]],
-        r"row \d+: round=1, beacon=1 stands in row 2 already",
+        r"row \d+: round=1, beacon=1 is in row 2 already",
     ),
     ("a beacon too few", Ranging(), lambda rows: rows[:-1], r"rows; the first absent one is"),
     (

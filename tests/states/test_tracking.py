@@ -438,7 +438,7 @@ WALK = {
         ({"next": {"x": "x", "v": "v + w*w"}}, "next: depends on w by more than a factor"),
         (
             {"next": {"x": "x", "v": "v"}},
-            r"noise\.w: stands in no formula of next; add it to one, or leave it out",
+            r"noise\.w: is in no formula of next; add it to one, or remove it",
         ),
         ({"readings": {}}, "readings: is empty"),
         (

@@ -54,7 +54,7 @@ class AuditAnswer(Shown, Audit):
             found.append(Fact("Worst parameter", words))
         clear = (self.bias[:, 1] <= 0) & (self.bias[:, 2] >= 0)
         if clear.all():
-            found.append(Fact("Bias", "of no parameter is it told from 0."))
+            found.append(Fact("Bias", "no parameter has a significant one."))
         return found
 
 

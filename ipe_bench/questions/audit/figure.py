@@ -41,7 +41,7 @@ def draw_audit(found: Audit) -> Iterator[Drawing]:
     caption = "Steeper than the dashed line: larger than reported. Bent at its ends: heavy tails."
     if len(chosen) < claims.n:
         caption += f" The {len(chosen)} of {claims.n} parameters farthest from 1."
-    yield Drawing("audit", "Quantiles of errors beside the reported law", caption, fig)
+    yield Drawing("audit", "Quantiles of errors against the reported law", caption, fig)
 
 
 def quantiles(z: Array) -> tuple[Array, Array]:

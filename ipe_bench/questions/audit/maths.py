@@ -557,7 +557,7 @@ def _refuse_twice(frame: pd.DataFrame, name: str) -> None:
         own = {f"{column}_true", f"{column}_error"} & set(columns)
         again = base != column and base in columns and not own
         if column in columns[:i] or again:
-            raise UserError(f"{name}: column {base} stands there twice; leave one of them out")
+            raise UserError(f"{name}: column {base} is given twice; remove one")
 
 
 def _numbers(frame: pd.DataFrame, column: str, name: str) -> Array:
@@ -587,9 +587,7 @@ def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     twice = frame.duplicated([*index, "parameter"]).to_numpy()
     if twice.any():
         row = int(np.argmax(twice))
-        raise UserError(
-            f"{_place(name, row)}: a parameter stands there a second time in {', '.join(index)}"
-        )
+        raise UserError(f"{_place(name, row)}: a parameter is given twice in {', '.join(index)}")
     numbers = {column: _numbers(frame, column, name) for column in values}
     frame = frame.assign(**numbers)
     wide = frame.pivot_table(index=index, columns="parameter", values=values, sort=False)

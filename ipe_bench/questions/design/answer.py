@@ -138,7 +138,7 @@ def _further(design: Design) -> Iterator[Table]:
         " candidates that cuts the mean square of these shares most; an input's candidates reach to"
         " four times its range."
     )
-    title = "What to read next, beside today's readings"
+    title = "What to read next, in addition to today's readings"
     yield Table("further", title, "", columns, notes=[note])
 
 

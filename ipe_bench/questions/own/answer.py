@@ -23,7 +23,7 @@ below."""
 _NONE = 0.9
 """Likewise, the share below which none is taken."""
 _TOO_SMALL = 0.88
-"""Share of 95 % intervals that hold the truth below which they are said to be too small: of one
+"""Share of 95 % intervals that contain the truth below which they are said to be too small: of one
 estimate, this verdict is true of fresh data sets in nine of ten cases."""
 _TOO_LARGE = 0.75
 """Share of their width that would do, below which they are said to be too large."""
@@ -73,7 +73,7 @@ def _bars(one: Claim) -> str:
 
 def _bars_in_words(one: Claim) -> str:
     verdict = _bars(one)
-    share = f"{_about(one.holds)} hold the truth"
+    share = f"{_about(one.holds)} contain the truth"
     if verdict == "about right":
         return f"its error bars are about right ({share})"
     factor = one.factor if verdict == "too small" else 1.0 / one.factor
@@ -187,7 +187,7 @@ def _table(name: str, own: Own, point: Point, number: int) -> Table:
         words("estimator", [one.label for one in claims]),
         words("told", [one.told for one in claims]),
         texts("keeps track, %" if own.moving else "finds, %", _shares(claims, "finds")),
-        texts("95 % bars hold, %", _shares(claims, "holds")),
+        texts("truth in 95 % bars, %", _shares(claims, "holds")),
         words("worst", [one.worst for one in claims]),
         texts("factor", [f"{one.factor:.2g}" for one in claims]),
         texts("cost", [compact(one.cost) for one in claims]),

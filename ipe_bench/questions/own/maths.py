@@ -1,5 +1,5 @@
 """Simulates readings like a user's own, and counts which estimators find the best fit and whether
-their error bars hold the truth.
+their error bars contain the truth.
 
 Truths are the estimate, at every minimum that fits (a parametric bootstrap: Efron and Tibshirani,
 An Introduction to the Bootstrap, 1993, section 6.5); times and noise are those of the readings, and

@@ -82,7 +82,7 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
         texts("width", [compact(row.divergence.width) for row in rows]),
         texts("energy", [compact(row.divergence.energy) for row in rows]),
     ]
-    title = f"{name}: estimators beside the posterior"
+    title = f"{name}: estimators and the posterior"
     return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3)]
 
 
@@ -149,7 +149,7 @@ def write_posteriors(
         posterior_parts(title, found),
         draw_marginals(model, found),
         lead=(
-            "An estimate with its covariance is a Gaussian. Does it stand for the posterior, which"
+            "An estimate with its covariance is a Gaussian. Does it represent the posterior, which"
             " is sampled without linearisation?"
         ),
         facts=[counted(len(found), "trial")],
@@ -171,7 +171,7 @@ def finding(found: Sequence[Reference]) -> str:
         f"{enumerate_few(by_count[count])} in {count} of {trials}"
         for count in sorted(by_count, reverse=True)
     ]
-    return f"the Gaussian stands for the posterior: {'; '.join(listed)}"
+    return f"the Gaussian represents the posterior: {'; '.join(listed)}"
 
 
 def _facts(found: Sequence[Reference]) -> Iterator[Fact]:

@@ -59,9 +59,7 @@ def draw_marginals(model: Measurement, found: Sequence[Reference]) -> Iterator[D
         common.title(ax, with_unit(p.name, p.unit))
         common.full_ticks(ax)
     common.legend(fig, axes, {label: replace(each, marker="") for label, each in look.items()})
-    caption = (
-        f"Trial {one.trial}: draws of the posterior beside the Gaussians that estimators report"
-    )
+    caption = f"Trial {one.trial}: draws of the posterior, and the Gaussians that estimators report"
     if len(chosen) < model.n:
         caption += f", the {len(chosen)} parameters in which they differ most"
     yield Drawing("posterior", "Marginals", f"{caption}.", fig)

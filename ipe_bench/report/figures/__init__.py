@@ -33,7 +33,7 @@ FIGURES = (
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
 NAMES = {
     "digits": "digits of certified parameters that agree, by problem and estimator",
-    "published": "errors that were found beside published ones",
+    "published": "errors found, and errors published",
     "settings": (
         "error by setting, and how often a misfit is detected; of a number that is swept, an axis"
         " of it"
@@ -42,7 +42,7 @@ NAMES = {
     "success": "success at every error scale with names at the curves, for a talk or a README",
     "matrix": "success of every estimator at every error scale, best first",
     "distributions": "distribution functions of the error, a panel per error scale",
-    "calibration": "distribution of NEES beside the one for a right covariance",
+    "calibration": "distribution of NEES, and the one for a right covariance",
     "cost_against_accuracy": "median cost against the error that 95 % of trials stay below",
     "convergence": "how iterates approach their limit, a panel per estimator",
     "parameter_errors": (

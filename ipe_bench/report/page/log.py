@@ -38,15 +38,11 @@ NAME = "track"
 TABLE = "track.csv"
 SCHEMA = 1
 _NOTE = (
-    "Innovations are readings less their predictions, in predicted standard deviations, and NIS /"
-    " m (normalised innovation squared, per reading) is their mean square. Smoothers are judged by"
-    " the cost of their path, and one behind a filter by NIS and whiteness of that"
-    " filter. If the model is right both are chi-square with a degree per reading, and fit p is"
-    " the probability of larger ones. Innovations are white if the filter is right (Ljung and"
-    " Box). The verdict is on innovations alone: an error that readings do not show, such as the"
-    " turn of a whole map, leaves them as they are. A track is lost from the epoch from which most"
-    " of them are larger than all but one in a million by chance. A dash: the tracker has none of"
-    " it."
+    "NIS / m: mean square of innovations in predicted standard deviations; smoothers: cost of the"
+    " path. fit p: probability of a larger one. white p: Ljung and Box. Lost: from the epoch from"
+    " which most innovations exceed all but one in a million. The verdict is on innovations: an"
+    " error that readings do not show, such as the turn of a whole map, leaves it right."
+    " –: not available."
 )
 _OF_PARTICLES = (
     "Innovations of particles are by the mean and covariance of the readings that they predict;"
@@ -60,8 +56,8 @@ _OF_GATES = (
 _OF_CONSTANTS = (
     f"Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
     " the innovations, so only whiteness tests the model. Intervals of uncertain deviations are"
-    " intervals of the profile of the likelihood; of one that is held at 0, up to where it is 1.35"
-    " lower (95 %, one-sided)."
+    " profiles of the likelihood; of one that is held at 0, up to where it is 1.35 lower (95 %,"
+    " one-sided)."
 )
 _STORED = (
     *("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict"),

@@ -51,7 +51,7 @@ _WIDE_ENOUGH = 100
 _LEGEND = (
     "success: % of all trials (95 % interval); bold: best, or tied for best{failed}; error: median"
     " / 95 % quantile over {reference}; efficiency, NEES"
-    " (mean; in brackets the converged trials): 1 is ideal{sign}; cost: simulations per trial,"
+    " (mean; in parentheses the converged trials): 1 is ideal{sign}; cost: simulations per trial,"
     " median (mean where it differs); time: mean of a trial. More: ipe-bench list statistic."
 )
 _FAILED = "; failed: known / undetected, %"

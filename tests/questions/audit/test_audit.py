@@ -169,7 +169,7 @@ def changed(**columns):
         (frame(5), "there are 5 independent runs"),
         (changed(x_var=0.05), "row 2: x_std and x_var differ"),
         (changed(cov_y_y=[0.09] * 49 + [0.1]), "row 51: y_var and cov_y_y differ"),
-        (pd.concat([frame(), frame()[["x_std"]]], axis=1), "column x_std stands there twice"),
+        (pd.concat([frame(), frame()[["x_std"]]], axis=1), "column x_std is given twice"),
         (
             changed(x_std=np.inf, y_var=np.inf),
             "no row has an estimate with finite deviations of x, y",
@@ -225,7 +225,7 @@ def test_a_table_may_begin_with_blank_lines_and_have_4096_columns(tmp_path):
 def test_a_column_that_a_file_has_twice_is_refused(tmp_path):
     table = pd.concat([frame(), frame()[["x"]]], axis=1)
     table.to_csv(tmp_path / "runs.csv", index=False)
-    with pytest.raises(UserError, match="column x stands there twice"):
+    with pytest.raises(UserError, match="column x is given twice"):
         read_claims(tmp_path / "runs.csv")
     named = pd.DataFrame(
         {"x_error": [0.1, 0.2], "x_std": 1.0, "x.1_error": [0.1, 0.3], "x.1_std": 1.0}

@@ -108,7 +108,7 @@ def test_the_exact_gaussian_does_not_diverge_and_a_wrong_one_does_as_computed(li
     divergences = {"exact": right, "half": confident, "shifted": shifted}
     one: Any = SimpleNamespace(posterior=found, divergences=divergences)
     agreeing = (
-        "the Gaussian stands for the posterior: exact in {0} of {1}; half, shifted in 0 of {1}"
+        "the Gaussian represents the posterior: exact in {0} of {1}; half, shifted in 0 of {1}"
     )
     assert finding([one]) == agreeing.format(1, "1 trial")
     assert finding([one, one]) == agreeing.format(2, "2 trials")
