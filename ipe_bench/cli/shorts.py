@@ -11,11 +11,13 @@ from __future__ import annotations
 import ast
 import os
 import re
+import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from ipe_bench.basics.errors import UserError, did_you_mean, place_of, unknown
 from ipe_bench.basics.files import fault_of
@@ -32,14 +34,24 @@ _YAML = (".yaml", ".yml")
 _FUNCTION = re.compile(r"(?P<file>.+\.py)(:(?P<name>\w*))?")
 _FORMULA = re.compile(r"[-+*/^()<>]|\bif\b")
 """A sign that a word without a key is a formula, rather than a name."""
+_BARE = re.compile(r"[^\w.:/,=-]")
+"""What a shell may read as its own."""
 _FLAG = re.compile("--?[a-z][a-z-]*")
 _VALUED = re.compile(
     "-(cd|cn|c|p|i)|--(config-dir|config-name|experimental-rerun|cfg|package|info)"
 )
 """A flag of `run` whose value is the next word."""
-_NAMED = re.compile(r"\s*(?P<reading>[A-Za-z_]\w*)\s*=(?!=)\s*(?P<formula>.+)", re.DOTALL)
+_NAMED = re.compile(r"\s*(?P<reading>[A-Za-z_]\w*)\s*(?:=(?!=)|~)\s*(?P<formula>.+)", re.DOTALL)
+_DEFINED = re.compile(
+    r"\s*(?P<name>[A-Za-z_]\w*)\s*\([^)]*\)\s*=(?!=)\s*(?P<formula>.+)", re.DOTALL
+)
+"""A formula such as f(t) = a*t, with arguments."""
 _START = re.compile(r"measurement\.start(?:\.(?P<name>\w+)=|=\{(?P<names>.*)\}$)")
 _MODELS = ("measurement", "state_model")
+_ALIKE = 4
+"""Letters that a wrong key has in common with the one that is meant."""
+_NAMED_LIKE = {"deviation": "readings", "spread": "next"}
+"""Keys of a state model whose entries are named like those of another key."""
 
 
 @dataclass
@@ -90,7 +102,7 @@ def read(command: str, words: Sequence[str]) -> Short:
         _require_file(file)
     if not models:
         return Short(others, files)
-    return _Reader(command, files, others).read(models[0])
+    return _Reader(command, models[0], files, others).read()
 
 
 def _refuse_columns(words: Sequence[str], files: Sequence[str]) -> None:
@@ -153,6 +165,7 @@ def _require_pair(
     if models and typed:
         raise UserError(f"{models[0]}: is a model, and {typed[0]} is another; give one of them")
     if models and not files:
+        _refuse_no_readings(others)
         example = f"ipe-bench {command} {_shown(models[0])} readings.csv"
         raise UserError(f"{models[0]}: is a model without readings; add their file: {example}")
     if files and not models and keys.isdisjoint(_MODELS):
@@ -163,6 +176,14 @@ def _require_pair(
             " formula in quotes or a YAML file before it: ipe-bench"
             f' {command} "a*exp(-b*t)+c" {files[0]}, or choose measurement=NAME'
         )
+
+
+def _refuse_no_readings(words: Sequence[str]) -> None:
+    """Refuses what stands in the place of a file of readings."""
+    for word in words:
+        if "=" not in word and not word.startswith(("-", "~")):
+            near = did_you_mean(word, [one.name for one in Path().iterdir() if one.suffix in _DATA])
+            raise UserError(f"{word}: is no file of readings ({', '.join(_DATA)}){near}")
 
 
 def _refuse_bare_names(words: Sequence[str]) -> None:
@@ -176,6 +197,12 @@ def _refuse_bare_names(words: Sequence[str]) -> None:
 def _refuse_no_model(file: str, words: Sequence[str]) -> None:
     """Refuses what stands in a model's place: a formula of another column, or another word."""
     for word in words:
+        defined = _DEFINED.fullmatch(word)
+        if defined:
+            raise UserError(
+                f'{word}: write the formula alone, "{defined["formula"]}", or behind the name of'
+                " the column of the readings and ="
+            )
         reading = _reading_named(word)
         if reading:
             columns = ", ".join(_columns(read_tables([Path(file)])[0]))
@@ -187,6 +214,10 @@ def _refuse_no_model(file: str, words: Sequence[str]) -> None:
     bare = [word for word in words if "=" not in word and not word.startswith("~")]
     if bare and not flags:
         what = "is a folder" if Path(bare[0]).is_dir() else "is no model"
+        models = [one.name for one in Path().iterdir() if one.suffix in (".py", *_YAML)]
+        same = [name for name in models if Path(name).stem == bare[0]]
+        if same:
+            raise UserError(f"{bare[0]}: {what}; did you mean {same[0]}?")
         raise UserError(
             f"{bare[0]}: {what}; write a function's file, a formula in quotes or a YAML file in its"
             " place"
@@ -221,10 +252,12 @@ class _Reader:
     """Reads the model of a command, given its files of readings and its words KEY=VALUE."""
 
     command: str
+    model: str
     files: list[str]
     others: list[str]
 
-    def read(self, model: str) -> Short:
+    def read(self) -> Short:
+        model = self.model
         function = _FUNCTION.fullmatch(model)
         if function:
             _require_file(function["file"])
@@ -274,17 +307,36 @@ class _Reader:
                 f"{self.files[0]}: no column is left for the readings; {what} takes"
                 f" {enumerate_few(taken)}"
             )
+        if not taken:
+            raise UserError(
+                f"{self.files[0]}: no name in {what} is a column (there are {', '.join(free)});"
+                " correct the name, as columns are what the readings depend on"
+            )
+        rest = self._ignoring(free[1:])
         raise UserError(
             f"{self.files[0]}: columns {enumerate_few(free)} are not in {what}, and one of them has"
-            f" the readings; give measurement.reading={free[-1]} or another, and"
-            " ignore_columns=[NAME] for the rest"
+            f" the readings; if that is {free[0]}:"
+            f" {self._again(f'measurement.reading={free[0]}', rest)}"
         )
 
+    def _again(self, *words: str, model: str = "") -> str:
+        """Writes the whole command with further words, or with another model."""
+        typed = [model or self.model, *self.files, *self.others, *words]
+        quoted = [shlex.quote(word) if _BARE.search(word) else word for word in typed]
+        return f"ipe-bench {self.command} {' '.join(quoted)}"
+
+    def _ignoring(self, columns: Sequence[str]) -> str:
+        (ignored,) = self._typed("ignore_columns") or [""]
+        before = [name.strip() for name in ignored.strip("[]").split(",") if name.strip()]
+        return f"ignore_columns=[{','.join([*before, *columns])}]"
+
     def _refuse_unused(self, what: str, unused: Sequence[str], taken: Sequence[str]) -> None:
+        noun = "columns" if len(unused) > 1 else "column"
+        verb = "are" if len(unused) > 1 else "is"
         raise UserError(
-            f"{self.files[0]}: column {unused[0]} is not in {what}, which takes"
-            f" {enumerate_few(taken) or 'no column'}; correct the name, or leave the column out by"
-            f" ignore_columns=[{unused[0]}]"
+            f"{self.files[0]}: {noun} {enumerate_few(unused)} {verb} not in {what}, which takes"
+            f" {enumerate_few(taken) or 'no column'}; correct the name, or leave out what is not"
+            f" needed: {self._again(self._ignoring(unused))}"
         )
 
     def _noise(self) -> str:
@@ -301,7 +353,7 @@ class _Reader:
     def _function(self, file: str, name: str | None) -> Short:
         tree = _parsed(file)
         module = _module(file)
-        chosen = _chosen(file, tree, name)
+        chosen = self._chosen(file, tree, name)
         arguments = [*chosen.args.posonlyargs, *chosen.args.args]
         defaults = chosen.args.defaults
         first = len(arguments) - len(defaults)
@@ -323,10 +375,13 @@ class _Reader:
         absent = [column for column in wanted if column not in self.columns]
         if absent:
             free = self._free([*wanted, "reading"])
+            near = did_you_mean(absent[0], free)
+            starts = [f"measurement.start.{name}=1" for name in absent]
             raise UserError(
-                f"{self.files[0]}: has no column {absent[0]}, which {what} takes (there are"
-                f" {', '.join(self.columns)}{did_you_mean(absent[0], free)}); rename the column, or"
-                f" give the argument a start as default, as in {absent[0]}=1.0"
+                f"{self.files[0]}: has no {'columns' if absent[1:] else 'column'}"
+                f" {enumerate_few(absent)}, which {what} takes (there are"
+                f" {', '.join(self.columns)}{near}); rename the column, or, of a parameter, give"
+                f" its start: {self._again(*starts)}"
             )
         reading = self._reading(what, wanted, ["reading"])
         words = ["measurement=function", f"measurement.of={module}:{chosen.name}"]
@@ -347,6 +402,26 @@ class _Reader:
             elif start:
                 found |= dict(re.findall(r"(\w+)\s*:\s*([^,\s]*)", start["names"]))
         return found
+
+    def _chosen(self, file: str, tree: ast.Module, name: str | None) -> ast.FunctionDef:
+        """Finds the function that is named, or the only one whose name begins with a letter."""
+        functions = {one.name: one for one in tree.body if isinstance(one, ast.FunctionDef)}
+        public = [one for one in functions if not one.startswith("_")]
+        if name is not None:
+            if name not in functions:
+                raise UserError(f"{file}:{name}: {unknown(name, public, 'function')}")
+            return functions[name]
+        if not public:
+            raise UserError(
+                f"{file}: has no function; define the model, as in def model(t, a=1.0, b=0.5):"
+                " return a * t + b"
+            )
+        if len(public) > 1:
+            raise UserError(
+                f"{file}: has {len(public)} functions, {enumerate_few(public)}; begin the names of"
+                f" helpers with _, or name the model: {self._again(model=f'{file}:{public[0]}')}"
+            )
+        return functions[public[0]]
 
     def _told(self, columns: Sequence[str], reading: str) -> str:
         taken = f"columns {enumerate_few(columns)}" if columns else "no column"
@@ -388,10 +463,16 @@ class _Reader:
         files = ", ".join(self.files)
         if "next" in keys:
             words = ["state_model=formulas", f"state_model.file={file}"]
+            from ipe_bench.states.formulas import Formulas
+
             states = content["next"] if isinstance(content["next"], dict) else {}
+            self._require_complete(file, content, "state_model", Formulas)
             model = f"Model: states {enumerate_few(list(states))} of {file}, which move."
             return self._short(words, [model, f"Log: {files}, a row per epoch."])
         if "rates" in keys:
+            from ipe_bench.measurements.ode.described import Ode
+
+            self._require_complete(file, content, "measurement", Ode)
             words = ["measurement=ode", f"measurement.file={file}"]
             model = f"Model: differential equations of {file}."
             return self._short(words, [model, f"Readings: {files}.", self._noise()])
@@ -400,6 +481,45 @@ class _Reader:
             f"{file}: is no model: it has neither next: (a state model by formulas) nor rates:"
             f" (differential equations); {there}"
         )
+
+    def _require_complete(self, file: str, content: dict[str, Any], group: str, cls: type) -> None:
+        """Refuses a file with keys that mean nothing, or without those that are needed."""
+        options = {one.name: one for one in fields(cls) if one.init}
+        said = []
+        for key in [str(key) for key in content if key not in options]:
+            near = [name for name in options if name[:_ALIKE] == key[:_ALIKE]]
+            said.append(f"{key} means nothing{f' (did you mean {near[0]}?)' if near else ''}")
+        misnamed = bool(said)
+        typed = {".".join(re.split(r"[.=]", word)[1:2]) for word in self.others}
+        words = []
+        for name, one in options.items():
+            given = name in content or name in typed
+            if given or one.default is not MISSING or one.default_factory is not MISSING:
+                continue
+            entries = ", ".join(f"{key}: 1" for key in content.get(_NAMED_LIKE.get(name, ""), {}))
+            said.append(f"{name} is missing")
+            words.append(f"{group}.{name}={{{entries}}}")
+        if not misnamed and group == "state_model" and not typed & {"noise", "inputs", "constants"}:
+            for name in _undefined(content):
+                said.append(f"{name} is not defined")
+                key = "inputs" if name in self.columns else "noise"
+                words.append(f"{group}.{key}.{name}=1")
+        if not said:
+            return
+        remedy = f"write them there, or: {self._again(*words)}"
+        if misnamed:
+            remedy = f"its keys are {', '.join(options)}"
+        raise UserError(f"{file}: {'; '.join(said)}; {remedy}")
+
+
+def _undefined(content: dict[str, Any]) -> list[str]:
+    """Lists the names in the formulas of a state model that its file does not define."""
+    known = {"k", "t", "dt"}
+    for key in ("next", "noise", "inputs", "constants"):
+        known |= set(content.get(key, {}))
+    formulas = [*content.get("next", {}).values(), *content.get("readings", {}).values()]
+    names = [name for text in formulas for name in parse(str(text), "formula").names]
+    return [name for name in dict.fromkeys(names) if name not in known]
 
 
 def _reading_word(reading: str, usual: Sequence[str]) -> list[str]:
@@ -418,27 +538,6 @@ def _parsed(file: str) -> ast.Module:
         raise UserError(f"{place_of(error)}; correct the file") from None
     except ValueError:
         raise UserError(f"{file}: is not a text in UTF-8; save it as such") from None
-
-
-def _chosen(file: str, tree: ast.Module, name: str | None) -> ast.FunctionDef:
-    """Finds the function that is named, or the only one whose name begins with a letter."""
-    functions = {one.name: one for one in tree.body if isinstance(one, ast.FunctionDef)}
-    public = [one for one in functions if not one.startswith("_")]
-    if name is not None:
-        if name not in functions:
-            raise UserError(f"{file}:{name}: {unknown(name, public, 'function')}")
-        return functions[name]
-    if not public:
-        raise UserError(
-            f"{file}: has no function; define the model, as in def model(t, a=1.0, b=0.5): return"
-            " a * t + b"
-        )
-    if len(public) > 1:
-        raise UserError(
-            f"{file}: has {len(public)} functions, {enumerate_few(public)}; name the model, as in"
-            f" {file}:{public[0]}, or begin the names of helpers with _"
-        )
-    return functions[public[0]]
 
 
 def _module(file: str) -> str:

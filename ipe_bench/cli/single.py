@@ -106,6 +106,11 @@ def single(
         unsaid = [one for one in standard if one.partition("=")[0] not in words.keys]
         given = w.read(command, unsaid)
         jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
+        if len(jobs.specs) > 1:
+            raise UserError(
+                f"experiment={words.chosen('experiment')}: sweeps over {len(jobs.specs)} settings,"
+                f" and `ipe-bench {command}` takes one; give a value of each key that it sweeps"
+            )
         require_one_kind(words, jobs.specs[0])
         model = jobs.specs[0].state_model
         if moving and model is not None:

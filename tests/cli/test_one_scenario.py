@@ -96,3 +96,10 @@ def test_posteriors_exit_with_1_unless_the_populations_of_every_trial_agree(
     )
     monkeypatch.setattr(answer, "posterior_parts", lambda *args: [])
     assert ipe_bench("posterior", *SMALL, "trials=2")[0] == (0 if all(settled) else 1)
+
+
+def test_an_experiment_that_sweeps_needs_a_value_of_its_key(ipe_bench):
+    code, _, err = ipe_bench("design", "+experiment=paper")
+    assert code == 2
+    assert "sweeps over 5 settings" in err
+    assert ipe_bench("design", "+experiment=paper", "error_scale=10")[0] == 0

@@ -22,6 +22,12 @@ FILES = {
     "broken.py": "def f(t, a=1.0:\n    return a\n",
     "car.yaml": "next: {x: x + w}\nnoise: {w: 0.1}\nreadings: {z: x}\ndeviation: {z: 0.5}\n"
     "spread: {x: 2}\n",
+    "free.py": "def fall(t, h, v):\n    return h + v * t\n",
+    "bare.yaml": "next: {x: x + w}\nreadings: {z: x}\n",
+    "wrong.yaml": "next: {x: x + w}\nnoises: {w: 0.1}\nreadings: {z: x}\ndeviation: {z: 0.5}\n"
+    "spread: {x: 2}\n",
+    "ode.yaml": "rates: {x: -k*x}\nparameters: {k: 1}\n",
+    "warm.csv": "t,volt,temp\n0,1,20\n1,2,21\n2,3.5,22\n",
     "red.yaml": "colour: red\n",
     "bare.csv": "1,2\n3,4\n",
     "day.csv": "day,reading\n1,2\n2,3\n3,4\n",
@@ -95,6 +101,11 @@ def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: s
             "state_model=formulas state_model.file=car.yaml readings='log.csv'",
         ),
         (["measurement=ranging", "my.csv"], "measurement=ranging readings='my.csv'"),
+        (
+            ["y ~ a*t", "line.csv"],
+            "measurement=formula measurement.expression='a*t' measurement.start.a=1"
+            " readings='line.csv'",
+        ),
     ],
 )
 def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Path) -> None:
@@ -112,7 +123,7 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
         (["faling.py", "falling.csv"], "faling.py: there is no such file here; did you mean"),
         (["falling.py", "faling.csv"], "faling.csv: there is no such file here; did you mean"),
         (["none.py", "falling.csv"], "has no function; define"),
-        (["two.py", "falling.csv"], "has 2 functions, f, g; name the model, as in two.py:f"),
+        (["two.py", "falling.csv"], "or name the model: ipe-bench estimate two.py:f falling.csv"),
         (["two.py:h", "falling.csv"], "there is no such function (there are: f, g)"),
         (["broken.py", "falling.csv"], "broken.py, line 1: SyntaxError"),
         (["falling.py", "bare.csv"], "the first row has only numbers and is no header"),
@@ -123,7 +134,42 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
         (["a*t+b)", "line.csv"], "is not a formula at ')'"),
         (["a*exq(t)", "line.csv"], "exq(...): there is no such function; did you mean exp?"),
         (["a*tt+b", "line.csv"], "column t is not in the formula of a, tt, b"),
-        (["a*tt+b", "volt.csv"], "one of them has the readings"),
+        (
+            ["a*tt+b", "volt.csv"],
+            "no name in the formula of a, tt, b is a column (there are t, volt)",
+        ),
+        (
+            ["a*t+b", "warm.csv"],
+            "if that is volt: ipe-bench estimate 'a*t+b' warm.csv measurement.reading=volt"
+            " 'ignore_columns=[temp]'",
+        ),
+        (
+            ["volt = a*t", "warm.csv"],
+            "ipe-bench estimate 'volt = a*t' warm.csv 'ignore_columns=[tem",
+        ),
+        (
+            ["free.py", "line.csv"],
+            "line.csv: has no columns h, v, which fall(t, h, v) takes (there are t, y); rename the"
+            " column, or, of a parameter, give its start: ipe-bench estimate free.py line.csv"
+            " measurement.start.h=1 measurement.start.v=1",
+        ),
+        (
+            ["bare.yaml", "log.csv"],
+            "deviation is missing; spread is missing; w is not defined; write them there, or:"
+            " ipe-bench estimate bare.yaml log.csv 'state_model.deviation={z: 1}'"
+            " 'state_model.spread={x: 1}' state_model.noise.w=1",
+        ),
+        (
+            ["wrong.yaml", "log.csv"],
+            "noises means nothing (did you mean noise?); its keys are next",
+        ),
+        (["ode.yaml", "line.csv"], "ode.yaml: parameters means nothing; its keys are rates, start"),
+        (["falling", "falling.csv"], "falling: is no model; did you mean falling.py?"),
+        (
+            ["a*t+b", "line.cvs"],
+            "line.cvs: is no file of readings (.csv, .tsv, .txt, .dat, .parquet",
+        ),
+        (["f(t) = a*t+b", "line.csv"], 'write the formula alone, "a*t+b", or behind the name'),
         (["timed.py", "falling.csv"], "the argument t of f(t, a) has a default, which makes it"),
         (["gins", "line.csv"], "gins: is not KEY=VALUE; write measurement=gins"),
         (["t+y", "line.csv"], "no column is left for the readings"),
