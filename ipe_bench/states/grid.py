@@ -15,6 +15,7 @@ from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Count
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.particles import weighed
+from ipe_bench.states.passes import kept_of
 from ipe_bench.states.trackers import Tracker, Tracks
 
 _PATHS = 200
@@ -77,7 +78,14 @@ class Grid(Tracker):
 
     def fitting(self, model: StateModel) -> Grid | str:
         """Returns the grid of as many points as the model needs, these at least, or why none is
-        exact for it, in words that follow the tracker's label."""
+        exact for it, in words that follow the tracker's label. A model is asked once, which is no
+        cost of a trial."""
+        kept = kept_of(model)
+        if self not in kept:
+            kept[self] = self._fitting(model)
+        return kept[self]
+
+    def _fitting(self, model: StateModel) -> Grid | str:
         if model.n > 1:
             return f"is exact for one state, and {model.name} has {model.n}; leave it out"
         if model.state_periods:
@@ -133,7 +141,7 @@ class Grid(Tracker):
         suit."""
         model = steps.model
         out = Tracks.empty(model, len(z))
-        out.calls += (steps.grids.shape[1] + _PATHS) * model.evaluations
+        out.calls += steps.grids.shape[1] * model.evaluations
         faults = _Faults.none(len(z))
         m, P = model.prior
         # A start that is known exactly has a grid of one and the same point.
@@ -199,9 +207,13 @@ class _Faults:
 
 
 def _drawn(model: StateModel) -> Array:
-    """Draws states (paths, K + 1) before the first transition, and at each epoch."""
-    paths = StateModel.draw(model, 0, _PATHS)
-    return np.concatenate([paths.start, paths.x[..., 0]], axis=1)
+    """Draws states (paths, K + 1) before the first transition, and at each epoch, once for a
+    model."""
+    kept = kept_of(model)
+    if "drawn" not in kept:
+        paths = StateModel.draw(model, 0, _PATHS)
+        kept["drawn"] = np.concatenate([paths.start, paths.x[..., 0]], axis=1)
+    return kept["drawn"]
 
 
 def _grids(drawn: Array, extent: _Extent) -> Array:

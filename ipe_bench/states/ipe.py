@@ -23,8 +23,11 @@ _FAR = 1e8
 """An iteration has diverged once F is this many times that of the start."""
 _LOST = 3e13
 """Standard deviation of what is read, in those of its reading, of which no digits are left."""
-_NUMBERS = 5e7
-"""Numbers of the largest matrix of a trial, and of the slopes that are held at once."""
+_NUMBERS = 2e7
+"""Numbers of the largest matrix of a trial at most, which takes a gigabyte with what is made of
+it."""
+_AT_ONCE = 1e6
+"""Numbers of the slopes of trials that are held at once, unless one trial has more."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +72,10 @@ class PathIPE(Tracker):
         if why:
             return why
         N = sum(_widths(model))
-        M = model.m
-        if N * max(M, model.n * model.epochs) > _NUMBERS:
+        if N * max(model.m, model.n * model.epochs) > _NUMBERS:
             return (
-                f"needs a matrix of {M} readings by {N} unknowns for a path of {model.name}; "
-                "give fewer epochs"
+                f"takes more than a gigabyte for the {N} unknowns of a path of {model.name}; "
+                "give fewer epochs, or take lm_ieks"
             )
         return None
 
@@ -85,7 +87,7 @@ class PathIPE(Tracker):
         out.iterations = np.empty(trials, np.int64)
         # Trials in which the same readings are missing have the same frozen system.
         seen, pattern = np.unique(np.isfinite(z), axis=0, return_inverse=True)
-        at_once = max(1, int(_NUMBERS / (sum(_widths(model)) * model.n * model.epochs)))
+        at_once = max(1, int(_AT_ONCE / (sum(_widths(model)) * model.n * model.epochs)))
         for i, there in enumerate(seen):
             frozen = _Frozen.of(model, there)
             alike = np.flatnonzero(pattern.reshape(-1) == i)

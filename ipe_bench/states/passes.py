@@ -573,16 +573,21 @@ def _at(law: Linearised, state: _States, at: _States) -> tuple[Array, Array]:
 
 
 def passes(model: StateModel, kind: Kind) -> Passes:
-    """Returns the passes of a kind along a model, which keeps them as long as its functions stay
-    the same."""
-    kept = model.passes
-    functions = model.epoch_functions
-    # A copy with another prior or log begins with the passes of what it was copied from.
-    if kept.get("model") is not model or kept.get("functions") is not functions:
-        kept = vars(model)["passes"] = Kept(model=model, functions=functions)
+    """Returns the passes of a kind along a model."""
+    kept = kept_of(model)
     if kind not in kept:
         kept[kind] = (_Together if _suits(model, kind) else _ByEpoch)(model, kind)
     return kept[kind]
+
+
+def kept_of(model: StateModel) -> Kept:
+    """Returns what a model keeps for trackers, as long as its functions stay the same."""
+    kept = model.passes
+    functions = model.epoch_functions
+    # A copy with another prior or log begins with what is kept by what it was copied from.
+    if kept.get("model") is not model or kept.get("functions") is not functions:
+        kept = vars(model)["passes"] = Kept(model=model, functions=functions)
+    return kept
 
 
 def _suits(model: StateModel, kind: Kind) -> bool:

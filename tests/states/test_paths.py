@@ -361,3 +361,18 @@ def test_errors_of_an_even_scalar_state_are_held_against_the_bound():
     block = PathBlock.draw(StateScenario(EVEN), 0, 5)
     np.testing.assert_array_equal(block.gates(False), block.variances)
     np.testing.assert_array_equal(block.gates(True), block.smoothed_variances)
+
+
+def test_the_frozen_system_of_many_trials_is_solved_a_few_at_a_time(monkeypatch):
+    """Each has the same bits, whatever fits into memory at once."""
+    z = NEAR.draw(0, 5).z
+    together = PathIPE().track(NEAR, z)
+    monkeypatch.setattr("ipe_bench.states.ipe._AT_ONCE", 1)
+    one_by_one = PathIPE().track(NEAR, z)
+    np.testing.assert_array_equal(one_by_one.mean, together.mean)
+    np.testing.assert_array_equal(one_by_one.covariance, together.covariance)
+
+
+def test_a_path_whose_frozen_system_takes_more_than_a_gigabyte_is_refused():
+    assert PathIPE().hindrance(Pendulum(count=2000)) is None
+    assert "more than a gigabyte for the 5002 unknowns" in PathIPE().hindrance(Pendulum(count=2500))
