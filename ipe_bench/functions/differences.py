@@ -236,7 +236,7 @@ def judge(J: Array, found: Measured) -> NDArray[np.int8]:
         low = np.minimum(ahead.slope, behind.slope) - reach
         high = np.maximum(ahead.slope, behind.slope) + reach
         close = np.abs(J - central.slope) <= 3 * central.error + allowed
-        right = np.where(kink, (low <= J) & (high >= J), close)
+        right = np.isfinite(J) & np.where(kink, (low <= J) & (high >= J), close)
         telling = kink | (central.error <= _TELLING * size + 1e-300)
         known = np.isfinite(central.error)
     verdict = np.where(right & telling, RIGHT, UNKNOWN)
@@ -271,7 +271,7 @@ def steps_of_a_rough_function(h: Rows, x: Array, scale: Array, near: Near) -> St
         allowed = 3 * found.error + _TOLERANCE * np.maximum(size, _SMALL * largest)
         away = np.abs(slope - found.slope)
         # Per point and level, beside the largest slope of all outputs.
-        worst = (away / np.abs(found.slope).max(axis=1, keepdims=True)).max(axis=2)
+        worst = (away / size.max(axis=1, keepdims=True)).max(axis=2)
         usual = np.median(np.where(np.isfinite(worst), worst, np.inf), axis=1)
         # The narrowest of good steps meets the fewest jumps and kinks.
         narrowest = len(usual) - 1 - np.argmax(usual[::-1] <= _CLOSELY, axis=0)

@@ -3,8 +3,10 @@
 import numpy as np
 
 from ipe_bench.functions.differences import (
+    WRONG,
     along_units,
     by_steps,
+    judge,
     measured,
     steps_of_a_rough_function,
     unmoved,
@@ -58,3 +60,10 @@ def test_values_are_the_same_if_both_are_missing():
     assert same_values(np.array([[np.nan, 1.0]]), np.array([[np.nan, 1.0 + 1e-16]]))
     assert not same_values(np.array([[np.nan, 1.0]]), np.array([[2.0, 1.0]]))
     assert not same_values(np.array([[2.0, 1.0]]), np.array([[np.nan, 1.0]]))
+
+
+def test_an_infinite_slope_hides_no_wrong_one_beside_it():
+    x = np.zeros((1, 2))
+    found = measured(lambda x: 1e-15 * x.sum(axis=1)[:, None], x, along_units(np.ones(2), 1))
+    verdicts = judge(np.array([[[np.inf, 1.01e-15]]]), found)
+    assert verdicts.ravel().tolist() == [WRONG, WRONG]
