@@ -34,8 +34,16 @@ from ipe_bench.basics.options import component_classes
 _BY_NAME = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS", "IMPORT_NAME")
 """Instructions that ask for a variable of the module, or for a module."""
 _PLAIN = (type(None), type(...), bool, int, float, complex, str, bytes)
-_DEFINED = (type, types.FunctionType, types.MethodType, types.ModuleType)
-_DEFINED += (staticmethod, classmethod, property, functools.cached_property)
+_DEFINED = (
+    type,
+    types.FunctionType,
+    types.MethodType,
+    types.ModuleType,
+    staticmethod,
+    classmethod,
+    property,
+    functools.cached_property,
+)
 _PARTS = ("__func__", "__self__", "__wrapped__", "fget", "func")
 """Attributes that hold the functions of a method, of a property, and of what functools or a
 compiler makes of one."""
@@ -75,11 +83,6 @@ def definition_of(component: Any) -> Definition:
     return Definition(digest, frozenset(definitions.modules))
 
 
-def definition_digest(component: Any) -> str:
-    """Returns the digest of a component's definition."""
-    return definition_of(component).digest
-
-
 def importable_digest(component: Any) -> str:
     """Computes a digest of the code that another process imports by name, whatever its variables
     hold."""
@@ -113,7 +116,7 @@ def as_defined(component: Any, held: dict[str, Any]) -> Any:
     packages, or else the copy that `held` has, or gets, by the digest of the definition."""
     if _PIN in getattr(component, "__dict__", ()):
         return component
-    digest = definition_digest(component)
+    digest = definition_of(component).digest
     if not digest:
         return component
     if digest not in held:
@@ -143,12 +146,13 @@ def _copied(component: Any, *, pin: bool) -> Any:
 
 def _state_of(thing: Any) -> dict[str, Any]:
     """Returns an object's attributes without the values of cached properties."""
-    cls = type(thing)
-    state = dict(vars(thing))
-    for name in vars(thing):
-        if isinstance(inspect.getattr_static(cls, name, None), functools.cached_property):
-            del state[name]
-    return state
+    return {
+        name: value
+        for name, value in vars(thing).items()
+        if not isinstance(
+            inspect.getattr_static(type(thing), name, None), functools.cached_property
+        )
+    }
 
 
 @functools.cache
@@ -229,8 +233,6 @@ class Definitions:
             return thing.__name__
         if _stands_by_name(thing):
             return thing.__module__, thing.__qualname__
-        if isinstance(thing, type | types.FunctionType):
-            self._note(thing.__module__)
         if isinstance(thing, type):
             return self._class(thing)
         if isinstance(thing, types.FunctionType):
@@ -262,6 +264,7 @@ class Definitions:
         return [self.of(part) for part in (make, arguments, state, *listed)]
 
     def _class(self, cls: type) -> Any:
+        self._note(cls.__module__)
         slots = types.MemberDescriptorType | types.GetSetDescriptorType
         own = {
             name: value for name, value in sorted(vars(cls).items()) if not isinstance(value, slots)
@@ -278,6 +281,7 @@ class Definitions:
         return cls.__qualname__, bases, self.of(attributes)
 
     def _function(self, function: types.FunctionType) -> Any:
+        self._note(function.__module__)
         code = function.__code__
         known = function.__globals__
         text, names, attributes = _read(code)
@@ -357,6 +361,7 @@ def _read(code: types.CodeType) -> tuple[Any, frozenset[str], frozenset[str]]:
     attributes = set(code.co_names)
     for step in dis.get_instructions(code):
         argument: Any = step.argval
+        # Python 3.11 gives the names of keywords by their place alone.
         if step.opcode in dis.hasconst and step.arg is not None:
             argument = code.co_consts[step.arg]
         if isinstance(argument, types.CodeType):

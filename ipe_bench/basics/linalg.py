@@ -276,7 +276,7 @@ def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
         # H+ R^1/2 = U^-1 U^-T Hw'
         projected = np.matmul(inverse_U.swapaxes(1, 2), Hw.swapaxes(1, 2))
         whitened = np.matmul(inverse_U, projected)
-    deficient = np.zeros(len(H), dtype=bool)
+    deficient = np.full(len(H), False)
     if not well.all():
         whitened[~well], deficient[~well] = _by_orthogonal_factor(Hw[~well])
     if R.factor.ndim == 1:
@@ -289,7 +289,7 @@ def _by_orthogonal_factor(H: Array) -> tuple[Array, Mask]:
     whatever the units of its columns."""
     trials, m, n = H.shape
     if m < n:
-        return np.full((trials, n, m), np.nan), np.ones(trials, dtype=bool)
+        return np.full((trials, n, m), np.nan), np.full(trials, True)
     usable = finite(H)
     H = np.where(usable[:, None, None], H, 0.0)
     # Powers of two, which change no digit.

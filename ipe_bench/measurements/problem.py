@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from ipe_bench.basics.definitions import definition_digest
+from ipe_bench.basics.definitions import definition_of
 from ipe_bench.basics.errors import UserError, definition, place_of
 from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse, read_only
 from ipe_bench.basics.options import component_classes
@@ -140,7 +140,7 @@ def require_function(model: Measurement) -> None:
     if all(cls.__module__.startswith("ipe_bench.") for cls in component_classes(model)):
         return
     try:
-        complaint = _irregularity(model, definition_digest(model))
+        complaint = _irregularity(model, definition_of(model).digest)
     except TypeError:  # options that cannot be hashed
         complaint = _irregularity.__wrapped__(model, "")
     if complaint:

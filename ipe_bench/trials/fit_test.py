@@ -20,7 +20,7 @@ from typing import cast
 
 import numpy as np
 
-from ipe_bench.basics.definitions import definition_digest
+from ipe_bench.basics.definitions import definition_of
 from ipe_bench.basics.linalg import Array, Covariance, finite, information
 from ipe_bench.basics.streams import generator
 from ipe_bench.estimators.base import Estimator
@@ -131,7 +131,7 @@ def fit_probability(squares: Array, spread: Spread, noise: Noise, H: Array, R: C
         return np.full(len(squares), np.nan)
     with np.errstate(all="ignore"):
         basis = _basis(H[None], R)[0].tobytes()
-        reference = _reference(noise, definition_digest(noise), m, basis)
+        reference = _reference(noise, definition_of(noise).digest, m, basis)
         if reference is None:
             ratio = spread.mean / spread.squares
             return chdtrc(spread.mean * ratio, squares * ratio)
