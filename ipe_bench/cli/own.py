@@ -25,6 +25,11 @@ _LOGS = 100
 _MOST_READINGS = 4_000_000
 """Readings of all of them, which are held at once for each estimator: there are fewer of long data
 sets."""
+_MOST_EPOCHS = 200_000
+"""Epochs of all logs, which take some ten seconds of a model with a few states: there are fewer of
+long logs."""
+_LONGEST = 50_000
+"""Epochs of a log at most, of which the fewest logs take a minute."""
 _FEWEST = 20
 """Fewest of either that say anything of shares."""
 _REFUSED = "has no meaning with a model and readings of your own"
@@ -88,10 +93,16 @@ def _of_log(asked: Single, files: list[str]) -> tuple[Own, AbstractContextManage
     from ipe_bench.questions.own.tracks import own_log
 
     spec = asked.spec
-    trials = spec.trials or _LOGS
     if len(files) > 1:
         raise UserError(f"readings=[{','.join(files)}]: are several logs; name one")
     (log,) = asked.log_question(files[0]).logs
+    epochs = log.model.epochs
+    if epochs > _LONGEST:
+        raise UserError(
+            f"{files[0]}: has {epochs} rows, and logs of at most {_LONGEST} are simulated; give a"
+            " file with some of its rows"
+        )
+    trials = spec.trials or min(_LOGS, max(_FEWEST, _MOST_EPOCHS // epochs))
     folder = _folder(
         asked,
         trials,

@@ -1002,7 +1002,8 @@ def _at_zero(search: _Search, u: Array, i: int) -> float | None:
     down = u.copy()
     for logarithm in (-np.inf, up[i] - _NEAR_ZERO):
         down[i] = logarithm
-        if search(down) <= here + _EFFECT:
+        # The others, which stay where they are, raise the cost a little, too.
+        if search(down) <= here + 3 * _EFFECT:
             return float(logarithm)
     return None
 

@@ -358,7 +358,7 @@ class _Side:
     def _call_by_epoch(self, why: str, as_found: Judged | None = None) -> None:
         """Calls the model's own function epoch by epoch, with slopes as they were found best."""
         if as_found:
-            how = {part: getattr(as_found, part) for part in ("why", "noise", "within")}
+            how = {part: getattr(as_found, part) for part in ("why", "noise", "within", "steps")}
             self.own = {k: replace(one, **how) for k, one in self.own.items()}
         none = np.empty((1, 0))
         recordings = [Recording(one, np.array([k]), none) for k, one in self.own.items()]
@@ -380,7 +380,10 @@ class _Side:
             return
         noise = max(found.noise, one.noise)
         within = max(found.within, one.within)
-        self._call_by_epoch(self.functions.why, replace(found, noise=noise, within=within))
+        # Steps of a rough function were found once, and hold where few differences do not.
+        steps = one.steps if found.steps is None else found.steps
+        how = {"noise": noise, "within": within, "steps": steps}
+        self._call_by_epoch(self.functions.why, replace(found, **how))
 
 
 def _unlike(recorded: Recording, own: Judged, x: Array) -> str:

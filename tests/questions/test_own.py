@@ -172,6 +172,29 @@ def test_logs_of_a_linear_model_hold_their_intervals() -> None:
         own_log(Log(model, z + np.linspace(0, 80, 25)[:, None] ** 2), trackers, 5)
 
 
+def test_long_logs_have_fewer_simulated_ones_and_none_beyond_a_limit(
+    ipe_bench: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
+    told: list[int] = []
+
+    def simulated(log: Log, trackers: Any, trials: int, seed: int) -> Own:
+        told.append(trials)
+        raise UserError("enough")
+
+    monkeypatch.setattr("ipe_bench.questions.own.tracks.own_log", simulated)
+    monkeypatch.setattr("ipe_bench.cli.own._MOST_EPOCHS", 1000)
+    monkeypatch.setattr("ipe_bench.cli.own._LONGEST", 60)
+    (tmp_path / "walk.yaml").write_text(
+        "next: {x: x + w}\nreadings: {z: x}\nnoise: {w: 1}\ndeviation: {z: 1}\nspread: {x: 1}\n"
+    )
+    for rows in (5, 20, 60, 61):
+        (tmp_path / "log.csv").write_text("z\n" + "1\n" * rows)
+        code, _, err = ipe_bench("run", "walk.yaml", "log.csv")
+        assert code == 2
+    assert told == [100, 50, 20]
+    assert "log.csv: has 61 rows, and logs of at most 60 are simulated" in err
+
+
 @pytest.mark.slow
 def test_the_command_writes_what_it_says(ipe_bench: Any, tmp_path: Path) -> None:
     rows = [f"{t},{3 + 0.5 * t + 0.1 * (-1) ** (t // 2)}" for t in range(12)]

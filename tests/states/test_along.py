@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 import pickle
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -394,3 +394,41 @@ def test_other_values_of_options_need_no_other_machine_code(name, monkeypatch):
     assert {*made} == before
     np.testing.assert_allclose(there.f[:, 1], other.transition(x[:, 1], 1), rtol=1e-13)
     np.testing.assert_allclose(there.h[:, 1], other.observe(x[:, 2], 1), rtol=1e-13)
+
+
+@dataclass(frozen=True)
+class Rough(StateModel):
+    """A state that moves by its sine, to the tolerance of an integrator where it is large."""
+
+    size: float = 1e-5
+    states = (Parameter("a", "m"),)
+    times = np.arange(1.0, 9.0)
+    prior = Normal(np.array([0.5]), np.diag([0.04]))
+    calls: ClassVar[list[int]] = []
+
+    def transition(self, x, k):
+        x = np.array([float(a) for a in np.ravel(x)]).reshape(np.shape(x))
+        self.calls.append(x.size)
+        return np.sin(x) + self.size * np.sin(1e7 * x) * (x > 0.45)
+
+    def observe(self, x, k):
+        return x
+
+    def gain(self, k):
+        return np.array([[0.05]])
+
+    def R(self, k):
+        return 0.01 * np.eye(1)
+
+
+def test_a_rough_transition_takes_few_calls_for_its_slopes():
+    """A value, two for a slope and those of checks for each epoch and trial, and the track of the
+    smooth transition."""
+    rough = Rough()
+    z = rough.draw(0, 3, 1).z
+    assert rough.remarks()
+    rough.calls.clear()
+    tracks = ekf().track(rough, z)
+    assert sum(rough.calls) <= 4 * 3 * 8
+    smooth = ekf().track(Rough(size=0.0), z)
+    np.testing.assert_allclose(tracks.mean, smooth.mean, rtol=1e-3)
