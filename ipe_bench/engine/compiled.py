@@ -49,11 +49,14 @@ _IN_LIBRARY = (
     "pow",
     "fmod",
 )
-_IN_LIBRARY += ("fma", "memset", "memcpy")
-"""Functions of the C library that machine code may call: those of recorded programs, and those LLVM
-puts in place of an instruction that the processor lacks or of a loop."""
+_IN_LIBRARY += ("fma", "memset", "memcpy", "malloc", "free")
+"""Functions of the C library that machine code may call: those of recorded programs, those LLVM
+puts in place of an instruction that the processor lacks or of a loop, and memory."""
 
-POINTER, INTEGER = ctypes.c_void_p, ctypes.c_int64
+POINTER = ctypes.c_void_p
+INTEGER = ctypes.c_int64
+EMITTING = sorted(Path(__file__).with_name("emit").glob("*.py"))
+"""The modules that write intermediate representation."""
 
 
 @contextlib.contextmanager
@@ -77,7 +80,8 @@ def _target() -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     # Machine code is for this very processor: files keep its name and features in their keys.
-    cpu, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    cpu = llvm.get_host_cpu_name()
+    features = llvm.get_host_cpu_features().flatten()
     target = llvm.Target.from_default_triple()
     return target.create_target_machine(cpu=cpu, features=features, opt=1, reloc="pic", jit=True)
 
@@ -138,7 +142,8 @@ def _object_code(text: str) -> bytes:
     import llvmlite.binding as llvm
 
     module = llvm.parse_assembly(text)
-    module.triple, module.data_layout = _target().triple, str(_target().target_data)
+    module.triple = _target().triple
+    module.data_layout = str(_target().target_data)
     # LLVM's passes must not reorder sums: no fast-math flag is set in what is written.
     options = llvm.create_pipeline_tuning_options(speed_level=2)
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = (
@@ -164,14 +169,16 @@ def _machine() -> tuple[str, ...]:
 
 
 @functools.cache
-def digest_of(file: Path) -> str:
-    """Stands for the code of a module that writes intermediate representation: what it compiled
+def digest_of(*files: Path) -> str:
+    """Stands for the code of modules that write intermediate representation: what they compiled
     before a change is not used after it."""
-    return hashlib.sha256(file.read_bytes() + Path(__file__).read_bytes()).hexdigest()
+    code = [file.read_bytes() for file in (*files, Path(__file__))]
+    return hashlib.sha256(b"".join(code)).hexdigest()
 
 
 _NOTHING = ctypes.c_char * 0
-DOUBLE, WHOLE = np.dtype(np.float64), np.dtype(np.int64)
+DOUBLE = np.dtype(np.float64)
+WHOLE = np.dtype(np.int64)
 
 
 def at(a: Any, kind: Any = DOUBLE) -> int:

@@ -14,7 +14,6 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,7 +37,6 @@ _NARROW = 4
 """Lanes up to which half of the usual vectors do: one simulation of GINS in two thirds of the
 time."""
 Integers = NDArray[np.integer[Any]]
-_EMIT = Path(__file__).with_name("emit.py")
 _INTEGERS = (3, 5, 6, 9, 11)
 _ARGUMENTS = tuple(INTEGER if place in _INTEGERS else POINTER for place in range(15))
 
@@ -66,7 +64,9 @@ def emitted(
     def write() -> str:
         return getattr(importlib.import_module("ipe_bench.engine.emit"), name)(source, width)
 
-    return compiled.load(f"{source} {width} {compiled.digest_of(_EMIT)}", write, name, arguments)
+    return compiled.load(
+        f"{source} {width} {compiled.digest_of(*compiled.EMITTING)}", write, name, arguments
+    )
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ _ARGUMENTS = (*[POINTER] * 3, *[INTEGER] * 5)
 _OF_EACH = (POINTER, INTEGER, INTEGER)
 _BYTES = 8
 """Of a number."""
-_FILES = [Path(__file__), Path(__file__).with_name("emit.py"), Path(__file__).with_name("trace.py")]
+_FILES = [Path(__file__), Path(__file__).with_name("trace.py"), *compiled.EMITTING]
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,7 @@ class Step:
 @lru_cache(maxsize=256)
 def _compiled(step: Step) -> Callable[..., None]:
     width = compiled.width()
-    digests = [compiled.digest_of(file) for file in _FILES]
-    key = repr((step.key, width, digests))
+    key = repr((step.key, width, compiled.digest_of(*_FILES)))
 
     def write() -> str:
         emit = importlib.import_module("ipe_bench.engine.emit")

@@ -104,8 +104,7 @@ def named_step(
         # What is a number, or an input itself, becomes an expression.
         return Program.of([graph.apply("add", a, 0.0) for a in outputs], inputs)
 
-    digests = [compiled.digest_of(file) for file in _FILES]
-    key = repr((what, carried, each, shared, shown, digests))
+    key = repr((what, carried, each, shared, shown, compiled.digest_of(*_FILES)))
     sizes = (carried.size, tuple(one.size for one in each), shared.size, shown.size)
     return Step(hashlib.sha256(key.encode()).hexdigest(), record, *sizes)
 

@@ -162,7 +162,10 @@ print("ipe_bench.engine.emit" in sys.modules)
     assert [run.stdout.strip() for run in said] == ["True", "False"]
 
 
-@pytest.mark.parametrize("module", ["engine.compiled", "engine.emit"])
+@pytest.mark.parametrize(
+    "module",
+    ["engine.compiled", "engine.emit.integrator", "engine.emit.rows", "engine.emit.vectors"],
+)
 def test_what_machine_code_comes_from_is_part_of_the_source_that_results_depend_on(
     monkeypatch, module
 ):

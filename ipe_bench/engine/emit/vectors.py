@@ -1,0 +1,211 @@
+"""Instructions on vectors of doubles, a lane for each trial or direction, and loops."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from llvmlite import ir
+
+from ipe_bench.engine.trace import Program
+
+F64 = ir.DoubleType()
+I32 = ir.IntType(32)
+I64 = ir.IntType(64)
+PTR = ir.PointerType()
+VOID = ir.VoidType()
+_ARITHMETIC = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
+
+Value = Any
+"""A value of LLVM's intermediate representation."""
+
+
+class Vectors:
+    """Writes instructions on vectors of `width` doubles. A frame is a pointer to an array of such
+    vectors."""
+
+    def __init__(self, builder: ir.IRBuilder, width: int) -> None:
+        self.builder = builder
+        self.width = width
+        self.type = ir.VectorType(F64, width)
+
+    def place(self, frame: Value, index: int | Value) -> Value:
+        index = integer(index) if isinstance(index, int) else index
+        return self.builder.gep(frame, [index], source_etype=self.type)
+
+    def load(self, frame: Value, places: Iterable[int | Value]) -> list[Value]:
+        return [
+            self.builder.load(self.place(frame, i), typ=self.type, align=8 * self.width)
+            for i in places
+        ]
+
+    def store(self, values: Sequence[Value], frame: Value, places: Iterable[int]) -> None:
+        for value, i in zip(values, places, strict=True):
+            self.builder.store(value, self.place(frame, i), align=8 * self.width)
+
+    def load_at(self, array: Value, index: Value) -> Value:
+        """Loads numbers that lie side by side anywhere."""
+        place = self.builder.gep(array, [index], source_etype=F64)
+        return self.builder.load(place, typ=self.type, align=8)
+
+    def store_at(self, value: Value, array: Value, index: Value) -> None:
+        self.builder.store(value, self.builder.gep(array, [index], source_etype=F64), align=8)
+
+    def turned(self, square: list[Value]) -> list[Value]:
+        """Makes columns of the rows of a square matrix, by blocks of 1, 2, 4 numbers."""
+        lanes = range(self.width)
+        by = 1
+        while by < self.width:
+            upper = [i if not i & by else self.width + i - by for i in lanes]
+            lower = [i + by if not i & by else self.width + i for i in lanes]
+            for i in lanes:
+                if not i & by:
+                    one = square[i]
+                    other = square[i + by]
+                    square[i] = self._shuffled(one, other, upper)
+                    square[i + by] = self._shuffled(one, other, lower)
+            by *= 2
+        return square
+
+    def _shuffled(self, one: Value, other: Value, places: list[int]) -> Value:
+        mask = ir.Constant(ir.VectorType(I32, self.width), places)
+        return self.builder.shuffle_vector(one, other, mask)
+
+    def constant(self, value: float) -> Value:
+        return ir.Constant(self.type, [value] * self.width)
+
+    def spread(self, number: Value) -> Value:
+        """Makes a vector of equal numbers."""
+        nothing = ir.Constant(self.type, ir.Undefined)
+        single = self.builder.insert_element(nothing, number, ir.Constant(I32, 0))
+        return self.builder.shuffle_vector(
+            single, nothing, ir.Constant(ir.VectorType(I32, self.width), None)
+        )
+
+    def run(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
+        values = list(inputs)
+        assert len(values) == program.inputs
+        # Values are numbered as in the program: inputs, then the result of each operation.
+        for name, *numbers in program.operations:
+            constant = name == "constant"
+            values.append(
+                self.constant(*numbers)
+                if constant
+                else self.apply(name, *[values[i] for i in numbers])
+            )
+        return [values[i] for i in program.outputs]
+
+    def combine(
+        self, start: list[Value], weights: list[Value], slopes: list[list[Value]]
+    ) -> list[Value]:
+        """Computes start + sum of weight times slope."""
+        for weight, slope in zip(weights, slopes, strict=True):
+            start = [self.call("fma", weight, k, y) for k, y in zip(slope, start, strict=True)]
+        return start
+
+    def apply(self, name: str, *args: Value) -> Value:
+        """Writes one operation of a recorded program."""
+        builder = self.builder
+        if name in _ARITHMETIC:
+            return getattr(builder, _ARITHMETIC[name])(*args)
+        match name, args:
+            case "neg", [a]:
+                return builder.fneg(a)
+            # a b - c and c - a b round once, as a b + c does.
+            case "fms", [a, b, c]:
+                return self.call("fma", a, b, builder.fneg(c))
+            case "fnma", [a, b, c]:
+                return self.call("fma", builder.fneg(a), b, c)
+            case (("fma" | "sqrt" | "floor"), _):
+                return self.call(name, *args)
+            case (("less" | "less_equal"), [a, b]):
+                holds = builder.fcmp_ordered("<" if name == "less" else "<=", a, b)
+                return builder.select(holds, self.constant(1.0), self.constant(0.0))
+            case "where", [condition, a, b]:
+                return builder.select(
+                    builder.fcmp_unordered("!=", condition, self.constant(0.0)), a, b
+                )
+            case "remainder", [a, b]:
+                return self._remainder(a, b)
+        return self._each(name.replace("arc", "a"), *args)
+
+    def _remainder(self, a: Value, b: Value) -> Value:
+        """Writes NumPy's remainder, which has the sign of what divides, to the last bit."""
+        builder = self.builder
+        zero = self.constant(0.0)
+        rest = self._each("fmod", a, b)
+        some = builder.fcmp_ordered("!=", rest, zero)
+        other = builder.xor(
+            builder.fcmp_ordered("<", rest, zero), builder.fcmp_ordered("<", b, zero)
+        )
+        moved = builder.fadd(rest, b)
+        # A rest of 0 has the sign of what divides, too, which arctan2 tells.
+        below = builder.fcmp_ordered("<", b, zero)
+        nothing = builder.select(below, self.constant(-0.0), zero)
+        rest = builder.select(builder.fcmp_ordered("==", rest, zero), nothing, rest)
+        return builder.select(builder.and_(some, other), moved, rest)
+
+    def call(self, name: str, *args: Value) -> Value:
+        """Writes an instruction of the processor: fma (rounded once), sqrt or floor."""
+        return self.builder.call(
+            self._declared(f"llvm.{name}.v{self.width}f64", self.type, len(args)), args
+        )
+
+    def _each(self, name: str, *args: Value) -> Value:
+        """Calls a function of the C library, lane by lane."""
+        function = self._declared(name, F64, len(args))
+        result = ir.Constant(self.type, ir.Undefined)
+        for lane in (ir.Constant(I32, i) for i in range(self.width)):
+            number = self.builder.call(
+                function, [self.builder.extract_element(a, lane) for a in args]
+            )
+            result = self.builder.insert_element(result, number, lane)
+        return result
+
+    def _declared(self, name: str, kind: ir.Type, count: int) -> ir.Function:
+        module = self.builder.module
+        return module.globals.get(name) or ir.Function(
+            module, ir.FunctionType(kind, [kind] * count), name
+        )
+
+
+@contextmanager
+def loop(b: ir.IRBuilder, first: Value, last: Value, by: int = 1) -> Iterator[Value]:
+    """Writes a loop for i in range(first, last, by)."""
+    test = b.append_basic_block("test")
+    body = b.append_basic_block("body")
+    after = b.append_basic_block("after")
+    before = b.block
+    b.branch(test)
+    b.position_at_end(test)
+    # i is `first` on the way in, and i + by on the way round.
+    i = b.phi(I64)
+    i.add_incoming(first, before)
+    b.cbranch(b.icmp_signed("<", i, last), body, after)
+    b.position_at_end(body)
+    yield i
+    i.add_incoming(b.add(i, integer(by)), b.block)
+    b.branch(test)
+    b.position_at_end(after)
+
+
+def integer(value: int) -> Value:
+    return ir.Constant(I64, value)
+
+
+def number_at(b: ir.IRBuilder, array: Value, index: Value, kind: ir.Type = F64) -> Value:
+    return b.load(b.gep(array, [index], source_etype=kind), typ=kind)
+
+
+def put(b: ir.IRBuilder, value: Value, array: Value, index: Value) -> None:
+    b.store(value, b.gep(array, [index], source_etype=value.type))
+
+
+def room(b: ir.IRBuilder, kind: ir.Type, count: int = 1, align: int = 8) -> Value:
+    """Reserves memory of the function's own."""
+    made: Any = b.alloca(kind, size=count)
+    made.align = align
+    # llvmlite gives it a typed pointer, which stores refuse.
+    made.type = PTR
+    return made
