@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,15 @@ import pytest
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
 from ipe_bench.plugins import standard
-from ipe_bench.questions.own.answer import advice, frame, headline, sentences, taken
-from ipe_bench.questions.own.maths import Claim, Own, Point, own
+from ipe_bench.questions.own.answer import (
+    advice,
+    frame,
+    hardest,
+    headline,
+    sentences,
+    taken,
+)
+from ipe_bench.questions.own.maths import Claim, Own, Point, _claims, _Truth, own
 from ipe_bench.questions.own.tracks import own_log
 from ipe_bench.real.estimation import Question
 from ipe_bench.real.logs import Log
@@ -75,7 +83,11 @@ def test_two_answers_that_fit_are_both_truths() -> None:
     assert sorted(round(point.at["a"]) for point in found.points) == [-1, 3]
     shares = {round(point.at["a"]): point.claims[1].finds for point in found.points}
     assert shares[3] == 1.0
-    assert any(one.startswith("BUT your data have 2 answers that fit") for one in sentences(found))
+    assert any(one.startswith("Your data have 2 answers that fit: ") for one in sentences(found))
+    # The curve is found wherever the truth is, and the intervals are about one of the two.
+    assert "whichever of 2 answers that fit is right: take" in headline(found)
+    assert "its error bars of a are too small by far (about 0 %" in headline(found)
+    assert hardest(found).claims[0].held == 0
 
 
 @dataclass(frozen=True)
@@ -206,3 +218,58 @@ def test_the_command_writes_what_it_says(ipe_bench: Any, tmp_path: Path) -> None
     folder = tmp_path / "outputs/run-formula"
     assert (folder / "own.csv").read_text().startswith("truth,estimator,told,ranked,trials,finds")
     assert "On 20 simulated data sets like yours: take" in (folder / "own.html").read_text()
+
+
+def ranges() -> tuple[ib.Measurement, Any, float]:
+    """Ranges from three points that nearly lie on a line, with a start on the wrong side of it."""
+    ax = np.tile([0.0, 10.0, 20.0], 4)
+    columns = {"ax": ax.tolist(), "ay": np.where(ax == 10, 1.0, 0.0).tolist()}
+    start = {"x": 10.0, "y": -2.0}
+    return (
+        ib.measurements.Formula("sqrt((x-ax)^2+(y-ay)^2)", start, columns, reading="range"),
+        [8.0, 6.0],
+        0.8,
+    )
+
+
+def oxygen() -> tuple[ib.Measurement, Any, float]:
+    columns = {"t": [1.0, 2.0, 3.0, 4.0, 5.0, 7.0]}
+    start = {"b1": 20.0, "b2": 0.5}
+    return ib.measurements.Formula("b1*(1-exp(-b2*t))", start, columns), [19.14, 0.531], 2.55
+
+
+def true_shares(model: ib.Measurement, x: Any, s: float, number: int) -> dict[str, Claim]:
+    """What the estimators do on fresh data sets of the truth itself."""
+    truth = np.array(x) / model.sizes
+    h = model.simulate(truth[None])[0]
+    problem = ib.Scenario(model, ib.noise.Gaussian(s)).problem.without_prior()
+    given = SimpleNamespace(noise=ib.noise.Unknown())
+    fit: Any = SimpleNamespace(given=given, degrees_of_freedom=len(h) - model.n)
+    z = h + s * np.random.default_rng(1).standard_normal((number, len(h)))
+    claims = _claims(fit, problem, LEAST_SQUARES, _Truth(truth, (truth,)), z, str)
+    return {one.label: one for one in claims}
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(("case", "off"), [(oxygen, 0.12), (ranges, 0.15)])
+def test_what_is_said_from_one_data_set_is_true_of_a_thousand_others(case: Any, off: float) -> None:
+    """Of the worse of the answers that fit: a mirror that fits better by chance is not believed."""
+    model, x, s = case()
+    true = true_shares(model, x, s, 1000)
+    h = model.simulate(np.array([x]) / model.sizes)[0]
+    errors = []
+    for number in range(24):
+        z = h + s * np.random.default_rng(100 + number).standard_normal(len(h))
+        asked = Question(model=model, readings=z, estimators={"auto": ib.solvers.Auto()}).checked()
+        try:
+            found = own(asked, LEAST_SQUARES, 60, number)
+        except UserError:
+            continue
+        claims = hardest(found).claims
+        errors += [[one.finds - true[one.label].finds for one in claims]]
+        errors[-1] += [one.holds - true[one.label].holds for one in claims]
+    assert len(errors) >= 20
+    success, coverage = np.split(np.array(errors), 2, axis=1)
+    assert np.sqrt(np.mean(success**2)) < off
+    assert np.sqrt(np.mean(coverage**2)) < off
+    assert success.max() < 0.35

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,9 +60,21 @@ def _equal(own: Own, point: Point) -> list[Claim]:
     return [one for one in claims if one.finds >= top - slack]
 
 
+def hardest(own: Own) -> Point:
+    """Joins the answers that fit to one truth: of each estimator what it does at the answer where
+    it does worst, so that no claim depends on which of them is right."""
+    claims = []
+    for same in zip(*(point.claims for point in own.points), strict=True):
+        worst = min(same, key=lambda one: one.found)
+        least = min(same, key=lambda one: one.held)
+        claims.append(replace(worst, held=least.held, worst=least.worst, factor=least.factor))
+    where = min(own.points, key=lambda point: sum(one.found for one in ranked(own, point)))
+    return replace(where, claims=claims)
+
+
 def takes_one(own: Own) -> bool:
-    """Tells if an estimator can be taken at the least minimum."""
-    best = taken(own, own.points[0])
+    """Tells if an estimator can be taken, whichever answer that fits is right."""
+    best = taken(own, hardest(own))
     return best is not None and best.finds_between[1] >= _NONE
 
 
@@ -122,20 +135,20 @@ def advice(own: Own, point: Point) -> str:
 def headline(own: Own) -> str:
     """Returns the first line."""
     noun = "logs" if own.moving else "data sets"
-    return f"On {own.trials} simulated {noun} like yours: {advice(own, own.points[0])}"
+    several = ""
+    if len(own.points) > 1:
+        several = f", whichever of {len(own.points)} answers that fit is right"
+    return f"On {own.trials} simulated {noun} like yours{several}: {advice(own, hardest(own))}"
 
 
 def sentences(own: Own) -> Iterator[str]:
     """Yields what else is to be said, the gravest first."""
-    first, *others = own.points
-    if others:
-        other = others[0]
-        yield (
-            f"BUT your data have {len(own.points)} answers that fit. Were the truth at the other,"
-            f" {other.words}: {advice(own, other)}."
-        )
-    yield from _cheaper(own, first)
-    told = list(_told_a_prior(own, first))
+    if len(own.points) > 1:
+        each = [f"were {point.words} right, {advice(own, point)}" for point in own.points]
+        yield f"Your data have {len(own.points)} answers that fit: {'. And '.join(each)}."
+    worst = hardest(own)
+    yield from _cheaper(own, worst)
+    told = list(_told_a_prior(own, worst))
     if told:
         yield f"Not ranked, because they use a prior that you did not state: {'; '.join(told)}."
     for why in dict.fromkeys(own.left_out.values()):
