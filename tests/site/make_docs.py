@@ -37,7 +37,8 @@ from ipe_bench.plugins.construct import described, find_class
 from ipe_bench.plugins.discovery import CONTRACTS, PACKAGES, RECORD_GROUPS, Option, options
 from ipe_bench.report.figures import common, drawings
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.figures.views import in_focus, views
+from ipe_bench.report.figures.headline import picture
+from ipe_bench.report.figures.views import views
 from ipe_bench.report.page.headline import headline
 from ipe_bench.report.sections import report_tables
 from ipe_bench.report.style import house_style
@@ -120,6 +121,8 @@ _PARTS = {
 """Reduced settings of experiments that take minutes, of which no result is stored."""
 _FIGURES = {"paper": ("figure_2", "figure_3")}
 """The figures of an experiment's page, where they are not the first."""
+_LETTERS = 13
+"""Size of the letters of bars, which are read at a third of the page's width."""
 _OF_PARAMETERS = ("paper", "pendulum_book", "states")
 """Experiments whose pages show single parameters."""
 SOURCES = Path(ipe_bench.__file__).parent / "report" / "docs"
@@ -278,7 +281,7 @@ class Page:
         drawn = drawings(analysis, "all" if chosen else "main")
         figures = [one for one in drawn if one.name in chosen] if chosen else list(islice(drawn, 1))
         parts = [*headline(analysis), *report_tables(analysis)[:1]]
-        return cls(html(parts).strip(), figures, _small(analysis))
+        return cls(html(parts).strip(), figures, _small(analysis, figures))
 
     @property
     def words(self) -> list[str]:
@@ -385,18 +388,15 @@ def _asked(experiment: str) -> int:
     return int(re.findall(r"(\d+) would be computed", told)[-1])
 
 
-def _small(analysis: Analysis) -> Any:
-    """Draws one legible panel: success over the error scale, of the first of several settings by
-    the alphabet, or a bar for each estimator."""
+def _small(analysis: Analysis, drawn: Sequence[Drawing]) -> Any:
+    """Draws one legible panel: README's picture of the first of several settings by the alphabet,
+    what is drawn of all settings, or a bar for each estimator."""
     parts, _ = views(analysis)
     if parts and len(parts[0].scales) > 1:
-        view = min(parts, key=lambda part: part.label)
-        fig, (ax,) = common.panels(1, view.look, height=2.4)
-        look = in_focus(view.look, view.focus)
-        common.shares(ax)
-        common.curves(ax, view.totals, "success", look, view.scales, label="success")
-        common.end_names(ax, view.totals, "success", look)
-        return fig
+        return picture(min(parts, key=lambda part: part.label))
+    of_settings = [one.figure for one in drawn if one.name == "settings"]
+    if of_settings:
+        return of_settings[0]
     rows: Any = analysis.summary[analysis.summary["parameter"] == ALL]
     column = "success"
     for table in certified_tables(analysis.collection)[:1]:
@@ -405,8 +405,10 @@ def _small(analysis: Analysis) -> Any:
             "mean_lre_parameters" if table.name == "certified_averages" else "found",
         )
     means = rows.groupby("estimator")[column].mean().sort_values()
-    fig, (ax,) = common.panels(1, height=0.6 + 0.2 * len(means))
+    fig, (ax,) = common.panels(1, height=0.8 + 0.24 * len(means))
     ax.barh(list(means.index), means)
+    ax.tick_params(labelsize=_LETTERS)
+    ax.xaxis.label.set_size(_LETTERS)
     ax.set_xlabel(
         {"success": "success, mean over settings", "found": "root mean square error"}.get(
             column, "correct digits, mean"
