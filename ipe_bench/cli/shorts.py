@@ -271,6 +271,16 @@ class _Reader:
         # What was typed comes last, and replaces what the short form sets.
         return Short([*words, *self.others], self.files, [line for line in assumed if line])
 
+    def _refuse_bare(self, names: Sequence[str]) -> None:
+        """Refuses a parameter as a key, as in b1=3."""
+        for word in self.others:
+            name, equals, value = word.partition("=")
+            if equals and name in names:
+                raise UserError(
+                    f"{word}: measurement.start.{name}={value} sets the start, and"
+                    f" parameters.{name}.fixed={value} keeps the value"
+                )
+
     # Columns
 
     def _free(self, taken: Sequence[str]) -> list[str]:
@@ -388,6 +398,7 @@ class _Reader:
         words += _reading_word(reading, ("reading",))
         shown = {one.arg: {**starts, **typed}.get(one.arg, "") for one in arguments}
         shown = {name: value for name, value in shown.items() if value}
+        self._refuse_bare([one.arg for one in arguments])
         model = f"Model: {what} of {file}{_values(shown)}."
         return self._short(words, [model, self._told(wanted, reading), self._noise()])
 
@@ -440,6 +451,7 @@ class _Reader:
         if named:
             usual = (named["reading"],)
         what = f"the formula of {', '.join(names)}"
+        self._refuse_bare(names)
         reading = self._reading(what, columns, usual)
         if not starts and not typed:
             raise UserError(

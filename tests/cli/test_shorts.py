@@ -117,6 +117,8 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
     ("words", "said"),
     [
         (["falling.py"], "is a model without readings; add their file"),
+        (["falling.py", "falling.csv", "v=3"], "v=3: measurement.start.v=3 sets the start, and"),
+        (["a*t+b", "line.csv", "b=3"], "b=3: measurement.start.b=3 sets the start, and"),
         (["a*t+b", "line.csv", "measurement.columns.t=[1,2]"], "columns.t: line.csv has the col"),
         (["readings=line.csv", "measurement.columns={t: [1]}"], "columns: line.csv has the col"),
         (["falling.csv"], "no model is given"),
