@@ -175,14 +175,20 @@ class Begun:
 
     @property
     def raised(self) -> list[str]:
-        """A line for each estimator whose trials raised exceptions, with the commonest of them."""
+        """A line for each estimator whose trials raised exceptions, with the commonest of them, and
+        for each that has no finite trial in a setting."""
         lines = []
         for label, rows in self._errors().items():
             trials = sum(row["trials"] for row in rows)
             commonest = max(rows, key=lambda row: row["trials"])
             times = "1 trial" if trials == 1 else f"{trials} trials"
             lines.append(f"{label}: {times} ended by an exception: {commonest['message']}")
-        return lines
+        lines += [
+            f"{row['estimator']}: no trial is finite: {row['message']}"
+            for row in self._rows["endings"]
+            if row["status"] == Status.NONFINITE.label and row["share"] == 1 and row["message"]
+        ]
+        return list(dict.fromkeys(lines))
 
     @property
     def useless(self) -> list[str]:

@@ -764,3 +764,16 @@ def test_progress_names_what_the_sweep_gives_to_a_job(command, label):
     typed = ("measurement=gins",) if " -m " in command else ()
     job = Outcome("outputs/mine", (*typed, "+noise.deviation=2", "error_scale=3"))
     assert job.label(command) == label
+
+
+def test_a_run_says_which_entry_of_a_model_is_not_finite(ipe_bench):
+    """A reading of 0/0 at the mean of the prior, where its slope is taken; sigma points miss it."""
+    model = ["next.x=x+w", "readings.z=sin(x)/x", "noise.w=0.1", "deviation.z=1", "spread.x=1"]
+    words = [f"state_model.{word}" for word in model]
+    asked = ["run", "state_model=formulas", *words, "tracker=[ekf,ukf]", "trials=4", "figures=none"]
+    code, out, _ = ipe_bench(*asked, "output=bad")
+    told = [line for line in out.splitlines() if "no trial is finite" in line]
+    assert code == 0
+    assert len(told) == 1
+    assert told[0].startswith("ekf: ")
+    assert "readings.z is nan at the mean of the prior" in " ".join(out.split())

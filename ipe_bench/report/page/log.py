@@ -42,7 +42,7 @@ _NOTE = (
     " path. fit p: probability of a larger one. white p: Ljung and Box. Lost: from the epoch from"
     " which most innovations exceed all but one in a million. The verdict is on innovations: an"
     " error that readings do not show, such as the turn of a whole map, leaves it right."
-    " –: not available."
+    " A dash: not available."
 )
 _OF_PARTICLES = (
     "Innovations of particles are by the mean and covariance of the readings that they predict;"
