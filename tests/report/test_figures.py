@@ -37,6 +37,7 @@ from ipe_bench.report.figures import (
 )
 from ipe_bench.report.figures.common import text, texts
 from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.headline import chosen
 from ipe_bench.report.figures.views import View, focus_of, views
 from ipe_bench.report.style import (
     COLORS,
@@ -486,6 +487,24 @@ def test_beside_long_names_labels_of_scales_stand_apart_and_no_leader_crosses_a_
         assert (
             box.arrow_patch.get_path().vertices[:, 0].max() <= box.offsetbox.get_window_extent().x0
         )
+
+
+def test_of_many_curves_those_of_the_success_picture_are_drawn_and_the_others_named(synthetic):
+    labels = [f"e{i}" for i in range(12)]
+    e = 0.1 * np.random.default_rng(0).standard_normal((30, 3))
+    for scale in (1.0, 10.0):
+        for i, label in enumerate(labels):
+            lost = np.arange(30)[:, None] < 2 * i
+            synthetic.add(synthetic.scenario(error_scale=scale), label, np.where(lost, 50.0, e))
+    view = only_view(synthetic)
+    drawing = drawn(errors, view)["headline"]
+    kept = {*view.focus, *chosen(view.totals, view.families)}
+    assert len(kept) < 12
+    named = drawing.caption.partition("Not drawn: ")[2]
+    assert {label for label in labels if re.search(rf"\b{label}\b", named)} == {*labels} - kept
+    drawn_names = {artist.get_gid() for ax in drawing.figure.axes for artist in ax.lines}
+    told = {str(gid).partition(":")[2].partition("#")[0] for gid in drawn_names if gid}
+    assert told == kept
 
 
 def test_at_most_four_are_in_colour_and_the_winner_in_a_strong_one(parted):

@@ -398,7 +398,7 @@ def prices(report: Report, match: Any) -> Iterator[tuple[str, str, bool]]:
 
 BARS = (
     r"Error bars: (?P<names>.*?) succeeds? at error scale (?P<scale>[\d.]+), but the reported"
-    r" covariance is too small\."
+    r" covariance is too small \(▲\)\."
 )
 
 

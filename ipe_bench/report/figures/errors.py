@@ -14,6 +14,7 @@ from scipy.special import gammainc
 from ipe_bench.basics.linalg import Array
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.headline import chosen
 from ipe_bench.report.figures.views import Figure, View, in_focus
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, Look, print_width, strong
 from ipe_bench.report.words import brief, enumerate_few, value_text
@@ -48,9 +49,14 @@ def draw(view: View) -> Iterator[Drawing]:
     start = _parting(view, totals) if several else view.scales[0]
     scales = [scale for scale in view.scales if scale >= start]
     rows = totals[totals["error_scale"] >= start]
+    # Many curves hide each other: those of README's picture are drawn.
+    kept = {*view.focus, *chosen(totals, view.families)} if several else {*view.look}
+    rows = rows[rows["estimator"].isin(kept)]
     count = 3 if rows["nees_mean"].notna().any() else 2
     height = max(3.3, 0.17 * len(view.look) + 1.6)
     look = _looks(view) if several else view.look
+    hidden = [label for label in look if label not in kept]
+    look = {label: one for label, one in look.items() if label in kept}
     fig, axes = common.panels(count, look, height=height, scales=scales, row=count)
     draw_panels(view, axes, rows, look, scales)
     named = several and not 0 < print_width() < _WIDE
@@ -61,7 +67,8 @@ def draw(view: View) -> Iterator[Drawing]:
     title = f"Success, error and reported covariance {over}"
     said = _start_in_words(view, start) if start > view.scales[0] else ""
     told = f"{BARS}{_ALONG}" if view.moving else BARS
-    yield view.drawing(fig, "headline", title, said, told, _solved_in_words(rows))
+    left_out = f"Not drawn: {enumerate_few(hidden, 4)}." if hidden else ""
+    yield view.drawing(fig, "headline", title, said, told, _solved_in_words(rows), left_out)
 
 
 def over_paths(view: View) -> pd.DataFrame:

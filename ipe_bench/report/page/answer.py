@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import numpy as np
 
 from ipe_bench.basics.errors import unknown
-from ipe_bench.basics.files import write_json
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement, with_unit
@@ -26,7 +25,7 @@ from ipe_bench.real.fits import TOO_WELL, Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.real.search import LABEL as SEARCH
 from ipe_bench.real.unlimited import limits_of
-from ipe_bench.report.page.writer import write_files
+from ipe_bench.report.page.writer import write_files, write_result
 from ipe_bench.report.tables.table import (
     Fact,
     Legend,
@@ -292,8 +291,7 @@ class Answer(Labelled[Fit]):
             tests = "the only test that readings without noise allow: residuals are round-off"
         elif not passing[0].fits:
             tests = (
-                "the tests that there are: the noise is unknown, so the size of residuals is not"
-                " tested"
+                "every available test: the noise is unknown, so the size of residuals is not tested"
             )
         said = []
         if tested:
@@ -747,10 +745,8 @@ def _turned(shift: float, near: float) -> str:
 
 def store(folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any]) -> Path:
     """Writes estimate.json, which has every estimate, and returns its path."""
-    content = {"schema": SCHEMA, "command": command, **estimate_content(answer), **provenance}
-    path = folder / f"{NAME}.json"
-    write_json(path, content)
-    return path
+    content = {**estimate_content(answer), **provenance}
+    return write_result(folder, NAME, SCHEMA, command, content)
 
 
 def write_page(

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.files import write_json
 from ipe_bench.measurements.base import with_unit
 from ipe_bench.real.logs import SEARCHES, Log, LogQuestion, LogTracks, far_below
 from ipe_bench.report.page.answer import Labelled, as_json, read_from, with_error
-from ipe_bench.report.page.writer import write_files
+from ipe_bench.report.page.writer import write_files, write_result
 from ipe_bench.report.tables.table import (
     Fact,
     Legend,
@@ -203,10 +202,7 @@ def store(
     tracker."""
     told: Any = {answer.name: _trackers(answer) for answer in answers}
     said = {"logs": told} if len(answers) > 1 else {"trackers": told[""]}
-    content = {"schema": SCHEMA, "command": command, **said, **provenance}
-    path = folder / f"{NAME}.json"
-    write_json(path, content)
-    return path
+    return write_result(folder, NAME, SCHEMA, command, {**said, **provenance})
 
 
 def write_page(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -79,6 +79,15 @@ def _is_free(folder: Path, result: str, command: Any, files: Sequence[str]) -> b
         return stored["command"] == command
     except (OSError, ValueError, KeyError, TypeError):
         return False
+
+
+def write_result(
+    folder: Path, name: str, schema: int, command: Any, content: Mapping[str, Any]
+) -> Path:
+    """Writes `name`.json with its schema and the command, and returns its path."""
+    path = folder / f"{name}.json"
+    write_json(path, {"schema": schema, "command": command, **content})
+    return path
 
 
 @dataclass(frozen=True)
