@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,10 +15,10 @@ from ipe_bench.questions.question import NAMES
 from ipe_bench.report.formats import PAGE
 from ipe_bench.report.style import Which, drawn_settings
 from ipe_bench.report.tables.table import Table, texts, words
-from ipe_bench.report.words import counted
+from ipe_bench.report.words import counted, enumerate_few
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import CellState, Results
-from ipe_bench.runs.store import require_results
+from ipe_bench.runs.store import Store, require_results
 
 _REPORT = {"output": str, "figures": str, "formats": str}
 _PAPER = {"output": str, "paper": NAMES, "columns": NAMES, "width": float}
@@ -28,7 +30,11 @@ def status_command(arguments: Sequence[str], verbose: bool = False) -> int:
     damaged."""
     if not arguments:
         raise UserError("status: name at least one directory of results, such as outputs/paper")
-    folders = require_results(arguments)
+    answers = {folder: _answer(Path(folder)) for folder in arguments}
+    for folder, answer in answers.items():
+        if answer:
+            say(f"{folder}: {answer}")
+    folders = require_results([folder for folder, answer in answers.items() if not answer])
     found = [Results.read([folder]) for folder in folders]
     for folder, results in zip(folders, found, strict=True):
         name = str(folder)
@@ -45,6 +51,35 @@ def status_command(arguments: Sequence[str], verbose: bool = False) -> int:
             verdict = f"complete: {counted}; estimates: {trials}"
         say(*(results.problems or results.stale), f"{name}: {verdict}")
     return 1 if any(results.problems for results in found) else 0
+
+
+def _answer(folder: Path) -> str:
+    """Says what a command that answers one question, such as `estimate`, left in a folder; empty if
+    none did."""
+    if Store(folder).runs.is_dir():
+        return ""
+    for file in sorted(folder.glob("*.json")):
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+            read = (content.get("readings") or []) if "command" in content else None
+            changed = [one["file"] for one in read or () if _has_changed(one)]
+        except (OSError, ValueError, AttributeError, KeyError, TypeError):
+            continue
+        if read is None:
+            continue
+        pages = ", ".join(sorted(page.name for page in folder.glob("*.html")))
+        if not pages:
+            return f"{file.name} without a page; the same command writes it again"
+        if changed:
+            return f"complete: {pages}; but {enumerate_few(changed)} changed since"
+        return f"complete: {pages}"
+    return ""
+
+
+def _has_changed(reading: Mapping[str, str]) -> bool:
+    """Tells whether a file of readings is there, and not as it was."""
+    file = Path(reading["file"])
+    return file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() != reading["sha256"]
 
 
 def _states(directory: str, cells: Sequence[CellState]) -> Table:

@@ -548,3 +548,18 @@ def test_each_of_several_logs_has_its_track_and_page(ipe_bench, tmp_path):
         "estimate", "state_model=formulas", *given, *words[:1], "readings=b.csv"
     )
     assert alone.split("last epoch")[1].split()[4:8] == out.split("last epoch")[2].split()[4:8]
+
+
+def test_status_says_what_a_folder_of_an_estimate_has(ipe_bench, tmp_path):
+    (tmp_path / "a.csv").write_text("z\n1\n2\n3\n")
+    model = "next.x=x+w readings.z=x noise.w=1 deviation.z=1 spread.x=5"
+    given = [f"state_model.{word}" for word in model.split()]
+    words = ["tracker=[ekf]", "readings=a.csv", "figures=none", "output=out"]
+    assert ipe_bench("estimate", "state_model=formulas", *given, *words)[0] == 0
+    code, out, _ = ipe_bench("status", "out")
+    assert (code, out) == (0, "out: complete: track.html\n")
+    (tmp_path / "a.csv").write_text("z\n1\n2\n4\n")
+    assert ipe_bench("status", "out")[1] == "out: complete: track.html; but a.csv changed since\n"
+    (tmp_path / "out" / "track.json").write_text('{"command": {}, "readings": [3]}')
+    code, _, err = ipe_bench("status", "out")
+    assert (code, "contains no results of ipe-bench" in err) == (2, True)
