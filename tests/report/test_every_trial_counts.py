@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
+from report.test_paper import read
 from shared.random_results import results
 
 from ipe_bench.report.figures import drawings
@@ -125,6 +126,8 @@ def alike_rows(analysis: Analysis) -> Iterator[str]:
         texts = [tuple(cell.text for cell in row) for row in rows]
         if len(set(texts)) < len(texts):
             yield f"{table.name}: rows look alike"
+        if not readable(latex(table)):
+            yield f"{table.name}: LaTeX or siunitx cannot read it"
         if isinstance(table, Matrix) or len(titles) < 4:
             continue
         # A choice of columns keeps what tells rows apart, in LaTeX and Markdown.
@@ -135,6 +138,14 @@ def alike_rows(analysis: Analysis) -> Iterator[str]:
             yield f"{table.name}: rows of an export look alike"
         if "inf" in re.sub(r"\\num\{[^}]*\}", "", latex(chosen)).replace(r"\infty", ""):
             yield f"{table.name}: inf in LaTeX"
+
+
+def readable(text: str) -> bool:
+    try:
+        read(text)
+    except AssertionError:
+        return False
+    return True
 
 
 # Verdicts -----------------------------------------------------------------------------------------

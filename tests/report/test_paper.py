@@ -51,7 +51,7 @@ COMMANDS = {
         "textbar",
         "textquotedbl",
     ),
-    *("texttt", "textsuperscript"),
+    *("texttt", "textsuperscript", "to", "triangle"),
 }
 TOKENS = re.compile(r"\\([a-zA-Z]+)|\\([^a-zA-Z])|%[^\n]*\n|([{}])|([^\\{}%]+)")
 
