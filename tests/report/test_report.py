@@ -37,7 +37,7 @@ from ipe_bench.report.tables.table import (
     texts,
     words,
 )
-from ipe_bench.report.tables.terminal import reported, summary_tables
+from ipe_bench.report.tables.terminal import _physical, reported, summary_tables
 from ipe_bench.report.words import brief, compact, cost, duration, percent, short
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.records import SCORES, STATISTICS
@@ -382,3 +382,15 @@ def test_the_page_says_which_commands_computed_what_it_shows(synthetic):
     assert page.count("<code>ipe-bench run -m error_scale=1,10</code>") == 2
     assert "finds it all" not in page
     assert page.count("from Python") == 1
+
+
+def test_physical_numbers_of_any_size_have_three_figures_and_what_is_not_finite_a_word():
+    shown = [_physical(value) for value in (1.5e-7, 2.0e6, 12.345, np.inf, np.nan)]
+    assert shown == ["1.50e-7", "2e6", "12.3", "inf", "-"]
+
+
+def test_a_single_trial_has_rows_of_costs_and_of_all_trials(synthetic):
+    synthetic.add(synthetic.scenario(), "one", np.full((1, 3), 0.1), estimator=Seeker())
+    synthetic.record(1)
+    tables = {table.name: table for table in all_tables(analyse([synthetic.directory]))}
+    assert len(tables["costs"]) == len(tables["all_trials"]) == 1

@@ -29,7 +29,11 @@ def test_the_velocities_are_multiples_of_the_step_and_their_errors_those_of_the_
     (drawing,) = drawn(tmp_path, model)
     assert "Error scale 33" in drawing.caption
     assert "240 velocities" in drawing.caption
-    _, read, errors = drawing.figure.axes
+    above, read, errors = drawing.figure.axes
+    # The platform is a square about its centre.
+    corners = np.transpose(above.lines[0].get_data())
+    np.testing.assert_array_equal(corners.sum(axis=0) - corners[0], [0.0, 0.0])
+    assert len({tuple(np.abs(corner)) for corner in corners}) == 1
 
     def points(ax):
         lines = [line.get_ydata() for line in ax.lines if line.get_marker() == "o"]

@@ -543,6 +543,11 @@ def test_a_title_writes_small_bounds_in_three_figures_as_the_table_does():
 def test_the_title_of_a_design_first_says_what_readings_leave_open():
     open_ = design(scenario(Linear(count=2)))
     assert _findings(open_)[0].startswith("The readings do not determine")
+    # Before what further readings would do, which is first where nothing is open.
+    with patch("ipe_bench.questions.design.answer._further_findings", lambda _: iter(["Read"])):
+        assert _findings(open_)[0].startswith("The readings do not determine")
+        assert _findings(open_)[1] == "Read"
+        assert _findings(design(scenario(Linear())))[0] == "Read"
 
 
 def test_shares_of_bounds_are_drawn_over_number_and_place(six_days):
