@@ -6,6 +6,7 @@ recorded is called epoch by epoch, with slopes that are judged wherever they are
 
 from __future__ import annotations
 
+import functools
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -78,8 +79,9 @@ class Recording(NamedTuple):
 
     def at(self, i: int) -> Recording:
         """Returns the function of the epoch in that place."""
-        here = self._replace(epochs=self.epochs[[i]], numbers=self.numbers[[i]])
-        return here._replace(own=self.own[i : i + 1])
+        place = slice(i, i + 1)
+        numbers = self.numbers[place]
+        return self._replace(epochs=self.epochs[place], numbers=numbers, own=self.own[place])
 
     @property
     def model(self) -> Callable[[Array], Array]:
@@ -405,12 +407,12 @@ def astray(f: EpochFunctions, h: EpochFunctions, x: Array) -> Mask:
     values and slopes of the model's own: at some epochs of each path, and where it is lost."""
     wrong = np.zeros(len(x), dtype=bool)
     for functions, states in ((f, x[:, :-1]), (h, x[:, 1:])):
+        known = np.isfinite(states).all(axis=2)
         for one in functions.recordings:
-            places = np.linspace(0, len(one.epochs) - 1, _CHECKED)
-            for i in np.unique(places.astype(int)).tolist():
-                here = states[:, one.epochs[i]]
-                rows = np.flatnonzero(np.isfinite(here).all(axis=1) & ~wrong)
-                wrong[rows] = _differs(one.at(i), here[rows])
+            for i in _checked(len(one.epochs)):
+                k = one.epochs[i]
+                rows = np.flatnonzero(known[:, k] & ~wrong)
+                wrong[rows] = _differs(one.at(i), states[rows, k])
     for k, rows in lost(x):
         here = x[rows, k]
         wrong[rows] |= _differs(f.at[k], here)
@@ -418,6 +420,13 @@ def astray(f: EpochFunctions, h: EpochFunctions, x: Array) -> Mask:
         found = np.flatnonzero(np.isfinite(moved).all(axis=1))
         wrong[rows[found]] |= _differs(h.at[k], moved[found])
     return wrong
+
+
+@functools.cache
+def _checked(epochs: int) -> list[int]:
+    """Returns the places of some of so many epochs."""
+    places = np.linspace(0, epochs - 1, _CHECKED)
+    return np.unique(places.astype(int)).tolist()
 
 
 def lost(x: Array) -> Iterator[tuple[int, Array]]:

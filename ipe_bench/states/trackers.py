@@ -324,15 +324,15 @@ def _passed(
 ) -> tuple[Tracks, Tracks]:
     """Runs passes of as many trials at once as memory allows."""
     there = passes(model, kind)
-    start = start or spread_prior(model, len(z))
+    begun = start or spread_prior(model, len(z))
     route = None if path is None else _route(path, there)
     at_once = there.at_once
     parts = []
     for i in range(0, max(len(z), 1), at_once):
         rows = slice(i, i + at_once)
         about = None if route is None else Route(route.mean[rows], route.root[rows])
-        first = Normal(start.mean[rows], start.covariance[rows])
-        found = there.run(z[rows], about, first)
+        first = Normal(begun.mean[rows], begun.covariance[rows])
+        found = there.run(z[rows], about, None if start is None else first)
         parts.append(_found(there, found, z[rows], first))
     tracks, smooth = parts[0] if len(parts) == 1 else map(Tracks.join, zip(*parts, strict=True))
     calls = _calls(model, kind)
