@@ -47,6 +47,25 @@ def test_the_columns_that_the_advice_on_choosing_names_are_there(tmp_path):
     assert re.search(r"`(\w+)` in `summary_all.csv`", page)[1] in table  # type: ignore[index]
 
 
+def test_the_default_loses_significantly_in_no_stored_experiment():
+    """README and the page on choosing say so."""
+    held = 0
+    for path in sorted(STORED.glob(f"*{SUFFIX}")):
+        pairs = read(path).analysis.pairs
+        for pair in pairs.to_dict("records"):
+            only = {pair["first"]: pair["only_first"], pair["second"]: pair["only_second"]}
+            if "auto" not in only:
+                continue
+            (rival,) = only.keys() - {"auto"}
+            worse = only[rival] > only["auto"] and pair["p_success"] < 0.05
+            assert not worse, (path.name, pair)
+            held += 1
+    assert held > 1000
+    assert "in no stored experiment does it lose significantly" in README
+    page = (ROOT / "ipe_bench/report/docs/pages/choosing.md").read_text(encoding="utf-8")
+    assert "succeed in significantly more of the same trials than\n`auto`" in page
+
+
 def test_it_has_at_most_650_words():
     assert len(README.split()) <= 650
 
