@@ -72,6 +72,8 @@ class PathIPE(Tracker):
         if why:
             return why
         N = sum(_widths(model))
+        if not N:
+            return f"has no unknowns: every state of {model.name} is known exactly; leave it out"
         if N * max(model.m, model.n * model.epochs) > _NUMBERS:
             return (
                 f"takes more than a gigabyte for the {N} unknowns of a path of {model.name}; "
