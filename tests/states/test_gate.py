@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 import ipe_bench as ib
+from ipe_bench.report.page.log import _facts
 from ipe_bench.states import Filter, Formulas, IteratedSmoother, Smoother, Unscented, ekf
 
 GATE = 0.999
@@ -141,7 +142,9 @@ def test_a_log_names_what_is_left_out_and_fits():
     assert (one.passes, one.verdict) == (True, "consistent")
     (note,) = one.notes
     assert note == "left out, as beyond the gate: 2 of 40 readings, at epochs 11, 26"
-    table = ib.estimate(LEVEL, z, {"ekf": Filter(gate=GATE)}).table()
+    answer = ib.estimate(LEVEL, z, {"ekf": Filter(gate=GATE)})
+    assert "5 % of the readings, beyond the gate of ekf" in str(_facts(answer)[-1])
+    table = answer.table()
     assert np.flatnonzero(table["z_left_out"]).tolist() == [10, 25]
     # A reading that is left out is predicted all the same.
     assert np.isfinite(table["z_predicted"]).all()

@@ -24,7 +24,7 @@ from ipe_bench.report.tables.table import (
     texts,
     words,
 )
-from ipe_bench.report.words import enumerate_few, p_value, short
+from ipe_bench.report.words import enumerate_few, p_value, percent, short
 from ipe_bench.statistics.verdicts import CONSISTENT, NO_VERDICT, shown
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
@@ -279,6 +279,12 @@ def _facts(answer: LogAnswer) -> list[str]:
                     f"they resemble each other {alike} chance explains: p {p_value(one.white_p)}.",
                 )
             )
+    gated = [one for one in answer if one.share_gated > 0]
+    if gated:
+        share = percent(gated[0].share_gated)
+        told.append(
+            Fact("Left out", f"{share} of the readings, beyond the gate of {gated[0].label}.")
+        )
     smoothers = [one.label for one in answer if one.smooths]
     if smoothers:
         told.append(Fact("Smoothers", f"{enumerate_few(smoothers)}, which use later readings."))
