@@ -3,15 +3,17 @@ covariance."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
-from report.test_finding import row
+from report.test_finding import row, sweep
 
 from ipe_bench.report.finding import Finding
 from ipe_bench.report.style import BLACK, DARK_RAMP, LIGHT, RAMP, WHITE, ink, step
-from ipe_bench.report.tables.matrix import Tile, matrices
+from ipe_bench.report.tables.matrix import Tile, _nearness, matrices
 from ipe_bench.report.tables.table import html, latex, markdown, plain_text
+from ipe_bench.report.tables.terminal import _MOST_LINES, _shortened
 from ipe_bench.report.words import percent, share_text
 from ipe_bench.statistics.intervals import clopper_pearson
 
@@ -238,3 +240,21 @@ def test_without_any_share_nobody_is_said_to_hold():
     nothing = {"success": float("nan"), "success_low": float("nan")}
     rows = [one | nothing for one in rows_of({"a": (200, 200), "b": (200, 200)})]
     assert Finding.of(rows).sentence().startswith("Too few trials to rank")
+
+
+def test_a_colour_is_the_paler_the_farther_from_1_to_either_side():
+    ratios = [1.0, 2.0, 0.5, 5.0, 0.2, 10.0, 0.1, 1e9, 0.0, float("inf"), float("nan")]
+    near = [_nearness(ratio) for ratio in ratios]
+    assert near[0] == 1.0
+    assert near[1] == pytest.approx(near[2]) == pytest.approx(1 - math.log10(2))
+    assert near[3] == pytest.approx(near[4]) == pytest.approx(1 - math.log10(5))
+    assert near[5:] == pytest.approx([0.0] * 6)
+
+
+def test_a_screen_has_as_many_settings_as_fit_with_their_heads_and_at_least_one():
+    rows = sweep(auto=(200,), ekf=(100,))  # of one scale
+    settings = {f"setting {i}": rows for i in range(40)}
+    kept = _shortened(settings)
+    used = sum(len(one) + 4 for one in kept.values())
+    assert used <= 0.4 * _MOST_LINES < used + len(rows) + 4
+    assert list(_shortened({"long": rows * 100})) == ["long"]
