@@ -21,6 +21,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import state_tables
+import stored_tables
 import word_drawings
 import yaml
 from docs_types import show_type, type_of
@@ -162,9 +163,11 @@ def test_the_report_that_the_repository_shows_is_what_todays_program_writes_of_w
 
 
 def rows_under(heading: str) -> dict[str, list[str]]:
-    """The first table below a heading of the results: the cells of a row by its estimator, or by
-    its first cell."""
-    below = (PAGES / "results.md").read_text(encoding="utf-8").partition(f"## {heading}\n")[2]
+    """The first table below a heading of the results, as the site has it: the cells of a row by its
+    estimator, or by its first cell."""
+    page = (PAGES / "results.md").read_text(encoding="utf-8")
+    text = stored_tables.with_tables(page, pages.STORED)
+    below = text.partition(f"## {heading}\n")[2]
     table = re.search(r"^\|-+\|.*\n((?:\|.*\n)+)", below, re.MULTILINE)
     assert table
     found = {}
@@ -199,11 +202,30 @@ def test_the_errors_under_a_wrong_model_are_the_stored_ones():
     columns = ["rmse_solved_over_linear_bound", "predicted_rmse", "nees_solved", "misfit"]
     stored = known.sort_values("predicted_rmse")[columns].to_numpy().tolist()
     shown = [
-        [float(cell.removesuffix(" %")) for cell in cells]
+        [float(cell.removesuffix(" %").replace(",", "")) for cell in cells]
         for cells in rows_under("A wrong model").values()
     ]
     for row, (*others, misfit) in zip(sorted(shown), stored, strict=True):
         assert row == pytest.approx([*others, 100 * misfit], rel=0.02)
+
+
+def test_the_tables_of_when_to_filter_are_the_stored_ones():
+    page = (PAGES / "explanation" / "when_to_filter.md").read_text(encoding="utf-8")
+    text = stored_tables.with_tables(page, pages.STORED)
+    assert "<!-- stored" not in text
+    known = totals(read(pages.STORED / f"headline{SUFFIX}")).set_index(["estimator", "error_scale"])
+    row = re.search(r"^\| 300 \|(.*)\|$", text, re.MULTILINE)
+    assert row
+    ekf, error, _, ukf, *_ = (cell.strip(" %") for cell in row[1].split("|"))
+    assert [float(ekf), float(ukf)] == [100 * known["success"][n, 300] for n in ("ekf", "ukf")]
+    assert float(error) == pytest.approx(known["error_median"]["ekf", 300], rel=0.01)
+    states = totals(read(pages.STORED / f"states{SUFFIX}"))
+    states = states[states["measurement"] == "bearings_only"]
+    success = states.set_index(["estimator", "error_scale"])["success"]
+    row = re.search(r"^\| 100 \| (99.*)\|$", text, re.MULTILINE)
+    assert row
+    names = ("auto", "lm_ieks", "ekf", "ukf", "ieks", "ipe_newton")
+    assert [float(cell) for cell in row[1].split("|")] == [100 * success[n, 100] for n in names]
 
 
 def test_the_traps_of_reading_a_report_are_the_stored_ones():

@@ -22,6 +22,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pandas as pd
+import stored_tables
 from gallery_frames import SUFFIX, Computed, read
 from notebooks import write_notebooks
 from readme import PICTURES, write_readme
@@ -186,6 +187,10 @@ def write_redirects(html: Path) -> None:
 
 def write_tables(source: Path) -> None:
     """Writes the tables that are built and not stored into their pages."""
+    for page in source.rglob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        if stored_tables.MARK.search(text):
+            write_text(page, stored_tables.with_tables(text, STORED))
     states = read(STORED / f"states{SUFFIX}").analysis
     page = source / TABLES
     write_text(page, with_tables(page.read_text(encoding="utf-8"), states))
