@@ -168,23 +168,17 @@ def profiles(
     found = []
     for k in range(len(x)) if places is None else places:
         ends = repeated(x, 2)
+        common = (float(q[k]), float(behind[k]), least, objective, released)
+        below, above = (_Side(problem, z, x, P, k, s, *common) for s in (-1, 1))
         try:
-            for row, s in enumerate((-1, 1)):
-                side = _Side(
-                    problem,
-                    z,
-                    x,
-                    P,
-                    k,
-                    s,
-                    float(q[k]),
-                    float(behind[k]),
-                    least,
-                    objective,
-                    released,
-                )
-                distance = side.end() if s in signs else np.inf
-                ends[row, k] += s * distance
+            low = below.end() if -1 in signs else np.inf
+            high = above.end() if 1 in signs else np.inf
+            free = len(signs) == 2 and np.isinf([limits[0][k], limits[1][k]]).all()
+            if free and np.isinf(low) and np.isfinite(high) and above.continues(below):
+                high = np.inf
+            elif free and np.isinf(high) and np.isfinite(low) and below.continues(above):
+                low = np.inf
+            ends[:, k] += [-low, high]
         except _BetterFit:
             ends[:, k] = np.nan
         with np.errstate(invalid="ignore"):
@@ -292,6 +286,12 @@ class _Side:
         if around:
             starts = np.vstack([starts, self._around(at)])
         point, total = _least_at(self.problem, self.z, self.place, at, starts, self.released)
+        risen = self._risen(total)
+        self.seen[distance] = risen, point
+        return risen
+
+    def _risen(self, total: float) -> float:
+        """Computes the rise of root chi-square to a sum of squares, at most twice q."""
         change = total - self.least
         if np.isfinite(self.behind):
             # Levels that are among the other parameters, of f degrees of freedom, raise chi-square
@@ -301,9 +301,16 @@ class _Side:
         if change < -_LOWER * max(1.0, self.least):
             raise _BetterFit
         # Where the model has no value, it has risen.
-        risen = float(np.fmin(np.sqrt(np.maximum(change, 0.0)), 2.0 * self.q))
-        self.seen[distance] = risen, point
-        return risen
+        return float(np.fmin(np.sqrt(np.maximum(change, 0.0)), 2.0 * self.q))
+
+    def continues(self, other: _Side) -> bool:
+        """Tells whether the profile of the other side, which has no end, goes on here behind
+        infinity, as that of V in V x / (K + x)."""
+        far = max(other.seen)
+        start = 2.0 * self.x - other.seen[far][1]
+        at = float(self.x[self.place] + self.sign * far)
+        _, total = _least_at(self.problem, self.z, self.place, at, start[None], self.released)
+        return self._risen(total) < self.q
 
     def _starts(self, distance: float, at: float) -> Array:
         """Returns the nearest points of the profile, of one side or of both, and where the nearest

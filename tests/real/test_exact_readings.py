@@ -166,6 +166,19 @@ def test_parameters_on_their_way_to_infinity_have_a_limit_of_one_side(positive):
     assert found["V"] == pytest.approx(f @ z / (f @ f), rel=0.01)
 
 
+def test_a_profile_that_goes_on_behind_infinity_has_no_end():
+    """The same curve is as good with K of either sign, if that is large: the truth, 20, is not to
+    be excluded by an estimate of -11."""
+    x = np.linspace(0.1, 2, 20)
+    z = 20 * x / (20 + x) + 0.3 * np.random.default_rng(0).standard_normal(20)
+    model = Formula("V*x/(K+x)", {"V": -8.0, "K": -11.0}, {"x": tuple(x.tolist())})
+    found = ib.estimate(model, z, LM).examination
+    assert found.x == pytest.approx([-8, -11], rel=0.1)
+    low, high = found.profiles
+    assert low.tolist() == [-np.inf, -np.inf]
+    assert high.tolist() == [np.inf, np.inf]
+
+
 def test_a_model_that_may_vanish_is_open_where_all_readings_are_zero():
     model = Formula("a*exp(-b*x)+c", dict.fromkeys("abc", 1.0), {"x": X})
     answer = ib.estimate(model, np.zeros(len(X)))

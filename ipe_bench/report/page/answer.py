@@ -694,9 +694,11 @@ def _on_profiles(found: Examination, names: Sequence[str]) -> Iterator[str]:
         ends = enumerate_few(list(compress(each, found.bent)), 3)
         level = f"{100 * CONFIDENCE:.0f} %"
         yield f"{_NONLINEAR} here: use the {level} profile intervals, {ends}."
-    unlimited = list(compress(names, np.any(np.isinf(found.profiles), axis=0)))
-    if unlimited:
-        yield f"The readings do not bound one side of {', '.join(unlimited)}."
+    infinite = np.isinf(found.profiles).sum(axis=0)
+    for sides, what in ((1, "one side of "), (2, "")):
+        unlimited = list(compress(names, infinite == sides))
+        if unlimited:
+            yield f"The readings do not bound {what}{', '.join(unlimited)}."
     lost = list(compress(names, np.any(np.isnan(found.profiles), axis=0)))
     if lost:
         yield (
