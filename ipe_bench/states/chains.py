@@ -92,7 +92,8 @@ class Noise:
         # An undamped trial has the same bits beside damped ones.
         damped = damping.any(axis=(1, 2))
         for some, more in ((~damped, ()), (damped, (np.sqrt(damping),))):
-            x[some] = self._states(of, *(part[some] for part in (*given, *more)))
+            if some.any():
+                x[some] = self._states(of, *(part[some] for part in (*given, *more)))
         return x
 
     def _states(self, of: Tangents, *given: Array) -> Array:
@@ -174,12 +175,17 @@ class Noise:
             yield rows, told[: rows.stop - i]
 
     def _steps(self, of: Tangents, damped: bool) -> _Steps:
-        return _steps(of.B.shape[2], *map(_places, self._patterns), damped)
+        return _steps(of.B.shape[2], *self._shapes, damped)
 
     @functools.cached_property
     def _patterns(self) -> tuple[Array, Array]:
         """Tells where the roots of some epoch are not 0."""
         return self.start != 0, (self.gains != 0).any(axis=0)
+
+    @functools.cached_property
+    def _shapes(self) -> tuple[Shape, Shape]:
+        start, gains = self._patterns
+        return _places(start), _places(gains)
 
     @functools.cached_property
     def _shared(self) -> tuple[Array, Array]:
