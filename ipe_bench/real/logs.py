@@ -679,10 +679,11 @@ def found_and_tracked(
         for log in logs:
             try:
                 model = sought.near(log.model, u)
-            except UserError:
-                # A model in Python may take no 0.
+                hindrance = tracker.hindrance(model)
+            except (UserError, np.linalg.LinAlgError):
+                # A model in Python, or a grid, may take no 0.
                 return np.inf
-            if tracker.hindrance(model):
+            if hindrance:
                 return np.inf
             tracks, _ = track_safely(tracker, model, log.z[None])
             value = -float(tracks.log_likelihood[0])

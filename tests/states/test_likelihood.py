@@ -100,9 +100,21 @@ def test_constants_and_errors_are_those_of_the_dense_likelihood():
             [(cost(e + f) - cost(e - f) - cost(f - e) + cost(-e - f)) / 4e-4 for e in E] for f in E
         ]
         np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(H))), 1.0, rtol=2e-3)
-        low, high = one.constants[1].low, one.constants[1].high
-        assert low * high == pytest.approx(w**2, rel=1e-9)
-        assert np.log(high / low) == pytest.approx(2 * norm.ppf(0.975) * scale[1], rel=1e-9)
+        for found, deviation in zip(one.constants[1:], scale[1:], strict=True):
+            if deviation < 0.25:
+                assert found.low * found.high == pytest.approx(found.value**2, rel=1e-9)
+                reach = 2 * norm.ppf(0.975) * deviation
+                assert np.log(found.high / found.low) == pytest.approx(reach, rel=1e-9)
+        # An uncertain one has the ends of its profile: the least cost by the others is 1.92 more.
+        assert scale[1] > 0.25
+        for end in (one.constants[1].low, one.constants[1].high):
+            logarithm = np.log(end / w)
+
+            def profile(others, logarithm=logarithm, cost=cost):
+                return cost(np.array([others[0], logarithm, others[1]]))
+
+            least = minimize(profile, [0.0, 0.0], method="Nelder-Mead").fun
+            assert least - cost(np.zeros(3)) == pytest.approx(norm.ppf(0.975) ** 2 / 2, abs=0.01)
 
 
 @pytest.mark.slow
