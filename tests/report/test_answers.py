@@ -363,7 +363,7 @@ def test_a_page_says_what_was_tested_only_where_something_was(walked):
             "Size of innovations",
             "Successive innovations",
         ][: 2 * tested]
-        assert smoothers == "Smoothers: rts, which use later readings."
+        assert smoothers == "Smoothers: rts: later readings count in their paths."
         assert (_finding(answer) == "tracks") != tested
 
 

@@ -174,7 +174,7 @@ def test_the_title_of_a_page_has_the_verdict_on_a_log_of_known_truth(verdict, tm
     page = (tmp_path / "track.html").read_text(encoding="utf-8")
     how = "the model fits" if verdict == "consistent" else "no tracker fits"
     assert f"<title>{FOLLOWED.name}: {how} the log: kf, ukf, rts {verdict} ·" in page
-    assert ">Smoothers</b> rts, which use later readings." in page
+    assert ">Smoothers</b> rts: later readings count in their paths." in page
 
 
 def test_the_title_of_a_page_names_the_trackers_of_each_verdict(tmp_path):

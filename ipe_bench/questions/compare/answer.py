@@ -283,7 +283,7 @@ def _cells(row: dict[str, Any], interval: str) -> dict[str, str]:
     """Returns what the columns of a table say of one quantity."""
     quantity = row["quantity"]
     show = {"success": percent, "time": lambda v: duration(v, 2)}.get(quantity, compact)
-    unit = " %" if quantity == "success" else ""
+    unit = " points" if quantity == "success" else ""
     change = "-"
     if math.isfinite(row["change"]):
         change = _change(quantity, row["change"]) + unit

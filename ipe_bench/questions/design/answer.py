@@ -108,7 +108,7 @@ def _further_findings(design: Design) -> Iterator[str]:
     two = f"at {where[1]} and {where[2]}"
     if where[1] == where[2]:
         two = f"twice at {where[1]}"
-    yield Fact("Two more readings", f"{two}; {_fall(design, further, 1, 3)}")
+    yield Fact("Two more after it", f"{two}; {_fall(design, further, 1, 3)}")
 
 
 def _fall(design: Design, further: Further, before: int, after: int) -> str:

@@ -387,7 +387,7 @@ def test_the_next_reading_cuts_bounds_most_and_may_lie_beyond_todays(six_days):
     most = int(np.argmin(further.bounds[3] / further.bounds[1]))
     size = six_days.observability.parameters[most].size
     high, low = (f"{size * further.bounds[k, most]:.3g}" for k in (1, 3))
-    assert more.startswith("Two more readings: twice at t = 25; the bound of")
+    assert more.startswith("Two more after it: twice at t = 25; the bound of")
     assert more.endswith(f"b{most + 1} then falls from {high} to {low}")
 
 
