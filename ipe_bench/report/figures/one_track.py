@@ -21,8 +21,6 @@ from ipe_bench.trials.one_track import position_of
 
 NAME = "one_track"
 MOST_PANELS = 4
-_COLORS = ("#2563eb", "#c2410c")
-"""Of the best tracker and of a filter."""
 _DEVIATIONS = 1.96
 """Standard deviations of a band of 95 %."""
 _ELLIPSE = 2.448
@@ -65,12 +63,13 @@ def draw(view: View) -> Iterator[Drawing]:
 
 
 def _looks(view: View, trackers: Sequence[str]) -> dict[str, Look]:
-    """Returns the looks of the best tracker and of the first other filter, or the next one."""
+    """Returns the looks of the best tracker and of the first other filter, or the next one:
+    lines in the colour that each has in every figure."""
     best = next((label for label in view.focus if label in trackers), trackers[0])
     others = [label for label in trackers if label != best]
     filters = [label for label in others if view.families.get(label) == "filters"]
     shown = [best, *(filters or others)[:1]]
-    return {label: Look(color, "") for label, color in zip(shown, _COLORS, strict=False)}
+    return {label: Look(view.look[label].color, "") for label in shown}
 
 
 def _draw_state(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:

@@ -287,5 +287,6 @@ def _facts(answer: LogAnswer) -> list[str]:
         )
     smoothers = [one.label for one in answer if one.smooths]
     if smoothers:
-        told.append(Fact("Smoothers", f"{enumerate_few(smoothers)}: later readings count in their paths."))
+        use = f"{enumerate_few(smoothers)}: later readings count in their paths."
+        told.append(Fact("Smoothers", use))
     return told
