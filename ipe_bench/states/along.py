@@ -407,7 +407,7 @@ def astray(f: EpochFunctions, h: EpochFunctions, x: Array) -> Mask:
     values and slopes of the model's own: at some epochs of each path, and where it is lost."""
     wrong = np.zeros(len(x), dtype=bool)
     for functions, states in ((f, x[:, :-1]), (h, x[:, 1:])):
-        known = np.isfinite(states).all(axis=2)
+        known = np.asarray(np.isfinite(states).all(axis=2))
         for one in functions.recordings:
             for i in _checked(len(one.epochs)):
                 k = one.epochs[i]
