@@ -271,9 +271,9 @@ def test_the_digest_is_of_the_bytes_that_were_estimated(estimate, misra, tmp_pat
     before = hashlib.sha256((tmp_path / "my.csv").read_bytes()).hexdigest()
     fitted = Question.fitted
 
-    def changed(self, *watching):
+    def changed(self, *watching, **asked):
         (tmp_path / "my.csv").write_text("t,y\n1,2\n")
-        return fitted(self, *watching)
+        return fitted(self, *watching, **asked)
 
     monkeypatch.setattr(Question, "fitted", changed)
     code, printed, answer = estimate(*SATURATION, *LM, "readings=my.csv")
