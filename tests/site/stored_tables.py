@@ -81,7 +81,7 @@ def _filters(analysis: Analysis) -> Iterator[Sequence[str]]:
     """Yields success, error and NEES of two filters and of `auto`."""
     names = ("ekf", "ukf", "auto")
     rows = _totals(analysis).set_index(["estimator", "error_scale"])
-    yield ["error scale", *(f"`{name}`: {word}" for name in names for word in _WORDS)]
+    yield ["error scale", *(f"`{name}` {word}" for name in names for word in _WORDS)]
     for scale in (33, 100, 300, 1000):
         found = [rows.loc[(name, scale)] for name in names]
         cells = [
