@@ -28,6 +28,7 @@ FORBIDDEN = {
     r"\bnotic(e|es|ed|ing)\b": "detect",
     r"\bwithout a word\b|\bsilent(ly)?\b": "undetected",
     r"(?:^|[.:;] )No (choice|data|rivals?) ": "no negation as subject",
+    r"(?:^|[ (|*±-])\.\d": "a zero before the point",
 }
 """What a reader stumbles over, with what to write."""
 RETIRED = dict(
@@ -139,6 +140,7 @@ def test_a_retired_phrase_is_found_where_it_stands(phrase):
         ("Surely too small.", "Surely"),
         ("No data can tell: a, b.", "data can tell"),
         ("It fails silently.", "silently"),
+        ("p below .05", " .0"),
         ("the share of failed_silent", ""),
         ("See [tracks](../checked.md#those-of-filterpy) and `that of`.", ""),
     ],
