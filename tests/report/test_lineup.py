@@ -12,6 +12,7 @@ import yaml
 from gallery_frames import SUFFIX, read
 from make_docs import STORED
 
+import ipe_bench as ib
 from ipe_bench.basics.files import own_conf
 from ipe_bench.report.finding import Finding
 from ipe_bench.statistics.records import family_of
@@ -84,3 +85,11 @@ def test_a_title_with_only_names_its_field():
     rows: Any = read(STORED / f"paper{SUFFIX}").analysis.totals
     said = Finding.of(rows.to_dict("records")).sentence()
     assert re.match(r"Of these 2, only fixed_point succeeds up to ", said)
+
+
+@pytest.mark.parametrize("model", ["bearings_only", "coordinated_turn", "pendulum", "walking_gins"])
+def test_each_tracker_of_the_experiment_can_track_each_of_its_models(model):
+    one = ib.component(f"state_model/{model}")
+    named = sorted(compared(EXPERIMENTS / "states.yaml"))
+    trackers = {name: ib.component(f"tracker/{name}") for name in named}
+    assert {name: each.hindrance(one) for name, each in trackers.items()} == dict.fromkeys(named)
