@@ -278,7 +278,9 @@ def steps_of_a_rough_function(h: Rows, x: Array, scale: Array, near: Near) -> St
         good = (usual <= _CLOSELY).any(axis=0)
         best = np.where(good, narrowest, np.argmin(usual, axis=0))
         each = np.arange(len(scale))
-        right = away[best, :, :, each] <= allowed.transpose(2, 0, 1)
+        # A ladder that does not settle, as on a function that jumps everywhere, tells of no step.
+        telling = found.error <= _TELLING * largest
+        right = (away[best, :, :, each] <= allowed.transpose(2, 0, 1)) & telling.transpose(2, 0, 1)
         right |= ~np.isfinite(found.slope).transpose(2, 0, 1)
         known = np.isfinite(usual[best, each]).all()
         nearly = (right.mean(axis=2) >= _NEARLY_ALL).all(axis=0)

@@ -96,7 +96,10 @@ class Grid(Tracker):
         noise = [_variances(model, grids, k).min() for k in range(model.epochs) if model.moves(k)]
         if not (np.array(noise) > 0).all():
             return f"needs process noise at every step of {model.name}; leave it out"
-        widest = max(_squared_step(model, grids, drawn, k) for k in range(model.epochs))
+        try:
+            widest = max(_squared_step(model, grids, drawn, k) for k in range(model.epochs))
+        except np.linalg.LinAlgError:
+            return f"needs noise in every reading of {model.name}; leave it out"
         excess = math.sqrt(widest / _COARSE)
         if not excess > 1:
             return self

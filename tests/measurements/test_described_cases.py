@@ -202,7 +202,9 @@ def test_the_column_of_the_readings_has_the_name_that_is_stated(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time,conc\n1,.9\n2,.8\n3,.73\n")
     decay = Ode({"y": "-k*y"}, {"k": 0.1}, {"y": 1.0})
-    with pytest.raises(UserError, match=r"column reading is missing.*set measurement.reading=conc"):
+    with pytest.raises(
+        UserError, match=r"column reading of.* is missing.*set measurement.reading=conc"
+    ):
         open_together([path], decay)
     assert open_together([path], replace(decay, reading="conc")).z.tolist() == [0.9, 0.8, 0.73]
     with pytest.raises(UserError, match="conc: is a column of every readings file"):

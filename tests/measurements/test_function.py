@@ -329,7 +329,7 @@ def test_a_function_that_writes_into_a_column_or_ends_the_process_is_refused_wit
 
 
 def test_a_function_inside_another_is_refused():
-    with pytest.raises(ib.UserError, match="stands in a module by its own name"):
+    with pytest.raises(ib.UserError, match="that a module defines under its own name"):
         function(lambda t, k=1.0: k * t)
 
 

@@ -94,8 +94,8 @@ CHANGES = {
     "bias-either": Change(
         "statistics",
         "bias is compared over trials in which either succeeds",
-        "a.inside_gate[one] & b.inside_gate[other]",
-        "a.inside_gate[one] | b.inside_gate[other]",
+        "np.logical_and(*_successes(a, b, one, other))",
+        "np.logical_or(*_successes(a, b, one, other))",
         "test_margins.py test_compare.py",
     ),
     "widened-by-second": Change(
@@ -954,11 +954,11 @@ CHANGES = {
         "pass",
         "test_auto_tracker.py",
     ),
-    "tested-unsaid": Change(
+    "alike-unsaid": Change(
         "report",
-        "the page of a log says what was tested where nothing was",
-        "if _verdicts(answer):",
-        "if not _verdicts(answer):",
+        "the page of a log calls innovations alike that chance explains",
+        "one.white_p >= FIT_LEVEL else",
+        "one.white_p < FIT_LEVEL else",
         "test_answers.py",
     ),
 }

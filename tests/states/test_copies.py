@@ -84,7 +84,8 @@ def test_a_track_a_turn_away_is_as_good_and_less_probable():
     block = PathBlock.draw(StateScenario(SWINGING), 0, 3)
     none = np.zeros(3)
     near, there = (
-        block._scored(one, {}, none, block.smoothed_variances)[1] for one in (tracks, far)
+        block._scored(one, {}, none, block.smoothed_variances, block.gates(True))[1]
+        for one in (tracks, far)
     )
     np.testing.assert_array_equal(near["success"], there["success"])
     np.testing.assert_allclose(near["crlb_distance"], there["crlb_distance"], rtol=1e-6)

@@ -402,6 +402,13 @@ def test_particles_at_which_readings_have_no_density_are_a_reason():
     assert said == ["the readings of epoch 1 have no density at some states: f, h or a"] * 2
 
 
+def test_a_grid_is_of_no_model_with_readings_without_noise():
+    model = Formulas(**SCALAR | {"deviation": {"z": "0.5 + 0.5*sign(x - 1)"}, "start": {"x": 3.0}})
+    assert TRACKERS["grid"].hindrance(model) == (
+        "needs noise in every reading of formulas; leave it out"
+    )
+
+
 def test_a_model_without_noise_is_refused():
     class Noiseless(ConstantVelocity):
         R = StateModel.R
