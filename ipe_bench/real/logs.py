@@ -368,7 +368,7 @@ class LogTracks:
         effective = np.nan if tracks.effective is None else float(np.median(tracks.effective))
         lost_from = _lost_from(nis, tracks.degrees[0])
         if gated is not None and tracker.gate is not None:
-            lost_from = _blind_from(gated.any(axis=1), 1 - tracker.gate)
+            lost_from = _blind_from(gated, np.isfinite(log.z), tracker.gate)
         ended = Status.CONVERGED if tracks.status is None else Status(int(tracks.status[0]))
         message = "" if ended == Status.CONVERGED else f"{ended.label}: {ended.reason}"
         if tracks.by_epoch is not None and tracks.by_epoch[0]:
@@ -498,13 +498,17 @@ def _mean_within(gate: float | None) -> float:
     return float(chdtr(3.0, most) / gate)
 
 
-def _blind_from(gated: Mask, expected: float) -> int | None:
-    """Finds the first epoch, from 1 on, of gated readings from which on most epochs have some, more
-    of them than chance explains; None without one."""
-    following = np.cumsum(gated[::-1])[::-1]
-    left = np.arange(len(gated), 0, -1)
-    by_chance = bdtrc(following - 1.0, left, expected) > 1 - GATE
-    lost = np.flatnonzero(gated & (following > 0.5 * left) & ~by_chance)
+def _blind_from(gated: Mask, given: Mask, gate: float) -> int | None:
+    """Finds the first epoch, from 1 on, of gated readings (K, m) from which on most epochs with a
+    reading, of those that are given (K, m), have some, more of them than chance explains; None
+    without one."""
+    at = np.flatnonzero(given.any(axis=1))
+    some = np.asarray(gated.any(axis=1))[at]
+    following = np.cumsum(some[::-1])[::-1]
+    left = np.arange(len(at), 0, -1)
+    expected = 1 - gate ** gated.shape[1]
+    by_chance = bdtrc(following - 1.0, left, expected) > GATE
+    lost = at[some & (following > 0.5 * left) & ~by_chance]
     return int(lost[0]) + 1 if len(lost) else None
 
 

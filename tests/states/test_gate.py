@@ -176,6 +176,33 @@ def test_a_filter_that_takes_no_reading_any_more_is_lost():
     assert (one.verdict, one.passes) == ("lost from epoch 35", False)
 
 
+def test_a_filter_is_lost_though_most_epochs_have_no_reading():
+    sparse = replace(LEVEL, count=200)
+    z = sparse.draw(0, 1, 1).z[0].copy()
+    z[np.arange(200) % 5 != 4] = np.nan
+    z[180:] += 500
+    (one,) = ib.estimate(sparse, z, {"ekf": Filter(gate=GATE)})
+    assert one.share_gated == 4 / 40
+    assert (one.verdict, one.passes) == ("lost from epoch 185", False)
+
+
+def test_an_outlier_at_the_end_of_a_log_is_no_lost_track():
+    z = LEVEL.draw(0, 1, 1).z[0].copy()
+    z[-1] += 30
+    (one,) = ib.estimate(LEVEL, z, {"ekf": Filter(gate=GATE)})
+    assert one.gated is not None
+    assert np.flatnonzero(one.gated).tolist() == [39]
+    assert (one.verdict, one.passes) == ("consistent", True)
+
+
+def test_chance_at_the_end_of_a_log_is_no_lost_track():
+    """A 95 % gate leaves out the last reading of one log in twenty; lost tracks leave out more."""
+    z = LEVEL.draw(0, 60, 7).z
+    tracks = [ib.estimate(LEVEL, one, {"ekf": Filter(gate=0.95)})[0] for one in z]
+    lost = [one for one in tracks if one.lost_from is not None]
+    assert all(one.share_gated > 0.2 for one in lost)
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
