@@ -317,4 +317,10 @@ class Formula(WrittenModel):
         J = np.empty((len(x), self.m, self.n))
         for i, column in enumerate(columns):
             J[:, :, i] = column * self.sizes[i]
+        lost = np.flatnonzero(np.isnan(J).any(axis=(1, 2)))
+        if len(lost):
+            # By the rules the slope of 1 / (1 + exp(800)) is infinity over infinity.
+            lost = lost[np.isfinite(self.simulate(x[lost])).all(axis=1)]
+            slopes = self._own_differences.differences(x[lost])
+            J[lost] = np.where(np.isnan(J[lost]), slopes, J[lost])
         return J

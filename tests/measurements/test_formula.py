@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import expit
 from shared.oracles import agreed, assert_agrees
 from shared.slopes import differentiate
 
@@ -338,3 +339,22 @@ def test_parameters_of_which_readings_are_constant_in_pieces_are_named():
         assert [text.partition(", but")[0] for text in said] == (
             [f"readings do not change with small changes of {named}"] if named else []
         )
+
+
+@pytest.mark.parametrize(
+    ("expression", "slope"),
+    [
+        ("1/(1+exp(-k*(t-2)))", lambda k, t: expit(k * (t - 2)) * expit(-k * (t - 2)) * (t - 2)),
+        ("exp(-exp(-k*(t-2)))", lambda k, t: (t - 2) * np.exp(-k * (t - 2) - np.exp(k * (2 - t)))),
+    ],
+)
+def test_slopes_are_known_where_an_exponential_overflows(expression, slope):
+    """Rules of differentiation meet infinity over infinity there, and the curve is flat."""
+    t = np.arange(5.0)
+    model = Formula(expression, {"k": 1.0}, {"t": t.tolist()})
+    k = np.array([[0.5], [200.0], [360.0]])
+    J = model.jacobian(k)
+    with np.errstate(over="ignore"):
+        known = slope(k, t)
+    np.testing.assert_allclose(J[:, :, 0], known, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(J[2:], model.jacobian(k[2:]))
