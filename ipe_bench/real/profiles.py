@@ -35,7 +35,7 @@ _STRAIGHT = 0.02
 """The share by which a rise differs at most from that of a linear model where steps may be
 large."""
 _PRECISION = 1e-8
-"""The precision of an end, as a share of the half-width."""
+"""The precision of an end, as a share of its distance and of the half-width."""
 _JUMP = 0.01
 """A rise at an end that is smaller than it should be by more than this share is that of another
 valley."""
@@ -228,13 +228,14 @@ class _Side:
         # A logarithm of which nothing is known may have any standard error.
         half = min(half, 8 * decade)
         near = 0.0
+        before = 0.0
         far = half / 8
         for _ in range(_STRETCHES):
             if far > _DECADES * decade:
                 break
             risen = self.rise(far)
             if risen >= self.q:
-                far = self._crossing(near, far, _PRECISION * half)
+                far = self._crossing(near, far, half)
                 risen = self.rise(far, around=True)
                 if risen >= (1 - _JUMP) * self.q:
                     before = self.rise((1 - _STEP) * far)
@@ -244,22 +245,30 @@ class _Side:
             # Small steps where the profile bends, since it may rise beyond q and fall again within
             # a large one.
             straight = abs(risen * half / (far * self.q) - 1) < _STRAIGHT
-            # A straight profile, whose rise is proportional to the distance, meets q there and 5 %
-            # on.
-            stretch = np.clip(1.05 * self.q / max(risen, 1e-3), 1.1, 9.0 if straight else 2.0)
+            # A profile that is straight from the point before meets q there, and 5 % on.
+            slope = max((risen - before) / (far - near), 1e-3 / far)
+            ahead = (1.05 * self.q - risen) / slope
+            stretch = np.clip(1.0 + ahead / far, 1.1, 9.0 if straight else 2.0)
             near = far
+            before = risen
             far *= float(stretch)
             if far > _FARTHEST * half:
                 break
         return np.inf
 
-    def _crossing(self, near: float, far: float, precision: float) -> float:
-        """Finds the distance between `near` and `far` at which the rise is q."""
+    def _crossing(self, near: float, far: float, half: float) -> float:
+        """Finds the distance between `near` and `far` at which the rise is q, to a share of itself
+        and of the half-width."""
         # By the Illinois method (Dowell and Jarratt 1971): scipy.optimize takes .08 s to load.
         low = self.rise(near) - self.q
         high = self.rise(far) - self.q
         turns = 0
-        while far - near > precision:
+        least = float(np.spacing(abs(self.x[self.place])))
+        while True:
+            # Of a standard error that is no size, the half-width is none either.
+            precision = max(_PRECISION * min(half, far), least)
+            if far - near <= precision:
+                return far
             share = high / (high - low) if high > low else 0.5
             met = far - share * (far - near)
             # Beside an end, a step beyond the crossing closes the interval.
@@ -273,7 +282,6 @@ class _Side:
                 far, high = at, here
                 low /= 2 if turns > 0 else 1
                 turns = 1
-        return far
 
     def rise(self, distance: float, *, around: bool = False) -> float:
         """Computes the rise of root chi-square at a distance; that of the least minimum found from

@@ -3,7 +3,7 @@ minima by name."""
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import norm
 from scipy.stats import t as t_law
 from shared.oracles import assert_agrees
@@ -17,7 +17,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Correlated, Gaussian, Unknown
 from ipe_bench.real.examination import answers, examine
 from ipe_bench.real.fits import fit, scaled
-from ipe_bench.real.levels import objective_of
+from ipe_bench.real.levels import maximise_likelihood, objective_of
 from ipe_bench.real.profiles import (
     CONFIDENCE,
     _ahead,
@@ -283,3 +283,51 @@ def test_a_profile_follows_a_positive_parameter_over_decades():
     assert low[1] == pytest.approx(brentq(lambda K: squares(K) - limit, 1, found.x[1]), rel=1e-4)
     assert squares(1e8) < limit
     assert high.tolist() == [np.inf, np.inf]
+
+
+def logistic(z, k, m):
+    """Fits L / (1 + exp(-k (t - m))) to readings at t = 0, 1, ... 10 from near its minimum."""
+    t = np.linspace(0.0, 10.0, 11)
+    start = {"L": float(z.max()), "k": k, "m": m}
+    return t, Formula("L/(1+exp(-k*(t-m)))", start, {"t": t.tolist()})
+
+
+def test_ends_of_a_profile_are_found_where_the_standard_error_is_no_size():
+    """Noisy readings of a logistic that may be a step: the standard error of its steepness is many
+    times the steepness. The end is held against the linear model that is left where steepness and
+    place are known."""
+    z = np.array([0.0526, 0.0188, 0.0054, -0.0162, 0.0747, 0.0964, 0.1092, 0.0962, 0.1320, 0.1089])
+    z = np.append(z, 0.1467)
+    t, model = logistic(z, 10.0, 3.93)
+    problem = Problem(model, Covariance(np.full(11, 0.0262)))
+    x = np.array([0.1149 / z.max(), 25.4 / 10.0, 3.9755 / 3.93])
+    x = maximise_likelihood(problem, z[None], x[None]).x[0]
+    J = model.jacobian(x[None])[0] / 0.0262
+    P = np.linalg.inv(J.T @ J + 1e-14 * np.eye(3))
+    assert np.sqrt(P[1, 1]) > 1e6
+    low, _ = profiles(problem, z, x, P, places=(1,), signs=(-1,))
+
+    def squares(k, m):
+        g = 1 / (1 + np.exp(-k * (t - m)))
+        return np.sum((z - (g @ z) / (g @ g) * g) ** 2) / 0.0262**2
+
+    least = np.sum((z - model.simulate(x[None])[0]) ** 2) / 0.0262**2
+    risen = minimize_scalar(lambda m: squares(low[0], m), (5.0, 20.0)).fun
+    assert risen - least == pytest.approx(norm.ppf(0.975) ** 2, rel=1e-4)
+
+
+def test_a_profile_goes_on_where_the_slopes_of_an_exponential_overflow():
+    """A logistic with one reading on its rise: its steepness has no upper end, since a step that is
+    however steep meets that reading."""
+    z = np.array(
+        [-0.0056, 0.0055, -0.0013, 0.0052, 0.1683, 0.4226, 0.4329, 0.43, 0.435, 0.42, 0.43]
+    )
+    t, model = logistic(z, 4.4, 4.1)
+    problem = Problem(model, Covariance(np.full(11, 0.007)))
+    found = maximise_likelihood(problem, z[None], model.nominal[None])
+    P = found.covariance[0]
+    _, high = profiles(problem, z, found.x[0], P, places=(1,), signs=(1,))
+    meets_it = np.where(t == 4, z, np.where(t > 4, z[t > 4].mean(), 0.0))
+    step = np.sum((z - meets_it) ** 2) / 0.007**2
+    assert step < found.chi_square[0] + norm.ppf(0.975) ** 2
+    assert high[0] == np.inf
