@@ -23,11 +23,14 @@ class AuditAnswer(Shown, Audit):
         names = self.claims.names
         columns = [
             words("parameter", names),
-            texts("true over reported", [f"{f.value:.2f}" for f in self.each]),
-            texts("97.5 % interval", [f"{f.low:.2f} to {f.high:.2f}" for f in self.each]),
+            texts("true over reported", [_known(f"{f.value:.2f}") for f in self.each]),
+            texts("97.5 % interval", [_known(f"{f.low:.2f} to {f.high:.2f}") for f in self.each]),
             words("reported", [f.verdict for f in self.each]),
-            texts("bias", [f"{value:+.2f}" for value in self.bias[:, 0]]),
-            texts("95 % of bias", [f"{low:+.2f} to {high:+.2f}" for low, high in self.bias[:, 1:]]),
+            texts("bias", [_known(f"{value:+.2f}") for value in self.bias[:, 0]]),
+            texts(
+                "95 % of bias",
+                [_known(f"{low:+.2f} to {high:+.2f}") for low, high in self.bias[:, 1:]],
+            ),
         ]
         joint = "No covariances are reported, so directions are not judged."
         if self.claims.joint:
@@ -47,7 +50,7 @@ class AuditAnswer(Shown, Audit):
         the report."""
         _, *faults = self.sentences
         found: list[str] = [Fact("Also found", sentence) for sentence in faults]
-        apart = [abs(math.log(f.value)) if 0 < f.value < math.inf else 0.0 for f in self.each]
+        apart = [abs(math.log(f.value)) if f.value > 0 else 0.0 for f in self.each]
         if len(apart) > 1 and max(apart) > 0:
             worst = apart.index(max(apart))
             words = f"errors of {self.claims.names[worst]} are {self.each[worst].words}."
@@ -56,6 +59,10 @@ class AuditAnswer(Shown, Audit):
         if clear.all():
             found.append(Fact("Bias", "no parameter has a significant one."))
         return found
+
+
+def _known(text: str) -> str:
+    return "-" if "nan" in text else text
 
 
 def write_audit(folder: Path, found: AuditAnswer, sources: Sequence[tuple[str, str]]) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import ndtri
 
+from ipe_bench.questions.audit.maths import FARTHEST
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, FAMILIES
@@ -35,7 +36,7 @@ def draw_audit(found: Audit) -> Iterator[Drawing]:
     for i, ax in zip(chosen, axes, strict=True):
         expected, errors = quantiles(claims.z[:, i])
         _draw_quantiles(ax, expected, errors, found.each[i].value)
-        common.title(ax, f"{claims.names[i]}: {found.each[i].value:.2f} times as reported")
+        common.title(ax, f"{claims.names[i]}: {_times(found.each[i].value)}")
     common.axis_labels(fig, "quantile if reported right", "error / reported deviation")
     common.legend(fig, axes)
     caption = "Steeper than the dashed line: larger than reported. Bent at its ends: heavy tails."
@@ -44,9 +45,15 @@ def draw_audit(found: Audit) -> Iterator[Drawing]:
     yield Drawing("audit", "Quantiles of errors against the reported law", caption, fig)
 
 
+def _times(factor: float) -> str:
+    if np.isfinite(factor):
+        return f"{factor:.2f} times as reported"
+    return "infinite errors" if factor > 1 else "too few runs with finite errors"
+
+
 def quantiles(z: Array) -> tuple[Array, Array]:
-    """Returns quantiles of the standard normal law and the finite errors z (rows,) that stand at
-    them, in order; infinite errors count in the ranks."""
+    """Returns quantiles of the standard normal law and the errors z (rows,) that stand at them, in
+    order; those that count as infinite count in the ranks alone."""
     errors = np.sort(z)
     rows = len(errors)
     expected = ndtri((np.arange(rows) + 0.5) / rows)
@@ -54,13 +61,16 @@ def quantiles(z: Array) -> tuple[Array, Array]:
     shown = np.unique(np.searchsorted(expected, even).clip(max=rows - 1))
     if rows <= MOST_POINTS:
         shown = np.arange(rows)
-    shown = shown[np.isfinite(errors[shown])]
+    shown = shown[np.abs(errors[shown]) < FARTHEST]
     return expected[shown], errors[shown]
 
 
 def _draw_quantiles(ax: Axes, expected: Array, errors: Array, factor: float) -> None:
     """Draws errors over their quantiles, with the lines on which they would be as large as reported
     and so many times as large."""
+    if not len(errors):
+        ax.set_axis_off()
+        return
     ends = np.array([expected[0], expected[-1]])
     dashed: Any = {"color": BOUND_COLOR, "linestyle": BOUND_DASH}
     color = FAMILIES["filters"][0]

@@ -45,7 +45,7 @@ _TAILS = 1.0
 """Shares of the level that the questions have: the first one is asked most."""
 _MANY = 1000
 """Rows above which the null distribution of the fourth moment is taken for normal."""
-_FARTHEST = 1e12
+FARTHEST = 1e12
 """Reported deviations beyond which an error counts as infinite, and whose inverse is 0."""
 _LARGEST = 10.0
 """Ends of an interval more than so many times its middle are not shown."""
@@ -138,6 +138,8 @@ class Factor:
     @property
     def words(self) -> str:
         """Sentence that compares true errors with reported ones."""
+        if self.value == np.inf:
+            return "infinite in some runs"
         known = self.high < _LARGEST * self.value
         span = f"{self.low:.2f} to {self.high:.2f}" if known else f"more than {self.low:.2g}"
         return f"{self.value:.2f} times as large as reported ({span})"
@@ -195,7 +197,7 @@ def audit(claims: Claims) -> Audit:
             and radians.
     """
     with np.errstate(over="ignore"):
-        lost = ~(np.abs(claims.z) < _FARTHEST)
+        lost = ~(np.abs(claims.z) < FARTHEST)
     if lost.any():
         return _with_infinite_errors(claims, lost)
     _require_evidence(claims)
@@ -231,7 +233,7 @@ def _require_evidence(claims: Claims) -> None:
             found += "; one log of dependent rows is too little evidence"
         raise UserError(f"audit: {found}; give at least {FEWEST_RUNS}")
     largest = np.abs(claims.z).max(axis=0)
-    none = (largest < 1 / _FARTHEST).any()
+    none = (largest < 1 / FARTHEST).any()
     if none or any(np.linalg.matrix_rank(part) < part.shape[1] for part in claims.parts):
         raise UserError(
             f"audit: the errors of {', '.join(claims.names)} are 0 in every run, or follow from one"
@@ -265,7 +267,7 @@ def _with_infinite_errors(claims: Claims, lost: NDArray[np.bool_]) -> Audit:
     )
     gone = claims.runs - others.runs
     said = (
-        f"The error is infinite, or beyond {_FARTHEST:g} reported deviations, in {gone} of"
+        f"The error is infinite, or beyond {FARTHEST:g} reported deviations, in {gone} of"
         f" {claims.runs} runs: the covariance is too small."
     )
     each = (Factor(np.nan, np.nan, np.nan),) * claims.n

@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.questions import question_command
 from ipe_bench.questions.audit.figure import MOST_POINTS, quantiles
@@ -402,3 +403,17 @@ def test_drawn_quantiles_are_those_of_the_normal_law_and_infinite_errors_keep_th
     assert len(errors) <= MOST_POINTS
     assert {many.min(), many.max()} <= set(errors)
     assert np.abs(errors - expected)[5:-5].max() < 0.3
+
+
+@pytest.mark.parametrize("lost", [np.inf, -np.inf, 1e300])
+@pytest.mark.parametrize("rows", [4, 40])
+def test_a_parameter_with_infinite_errors_is_the_worst_and_has_a_page(tmp_path, lost, rows):
+    """In some runs, and in all, where nothing is left to draw of it."""
+    errors = np.random.default_rng(0).standard_normal((40, 2)) * [1.0, 3.0]
+    errors[:rows, 0] = lost
+    columns = {"a_error": errors[:, 0], "b_error": errors[:, 1], "a_std": 1.0, "b_std": 1.0}
+    found = ib.audit(pd.DataFrame(columns), output=tmp_path)
+    assert "Worst parameter: errors of a are infinite in some runs." in found.facts()
+    assert f"in {rows} of 40 runs" in str(found)
+    assert "nan" not in str(found)
+    assert (tmp_path / "audit.html").is_file()
