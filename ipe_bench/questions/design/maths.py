@@ -265,10 +265,12 @@ def _most_readings(model: Measurement, candidates: Measurement, readings: int | 
             f"readings={readings}: {model.n} parameters need at least {model.n} readings"
         )
     if readings > candidates.m:
+        remedy = "make room for more with its options (`ipe-bench list measurement -v`)"
+        if len(model.inputs) == 1:
+            remedy = "remove the key: the answer says which two to read next"
         raise UserError(
             f"readings={readings}: {model.name} has {candidates.m} readings to choose among; give"
-            f" at most {candidates.m}, or make room for more with its options"
-            " (`ipe-bench list measurement -v`)"
+            f" at most {candidates.m}, or {remedy}"
         )
     return readings
 

@@ -195,7 +195,7 @@ def _facts(found: Sequence[Reference]) -> Iterator[Fact]:
         worst.append(f"{label} {compact(largest)}")
     yield Fact(
         "Largest divergence, in nats",
-        f"{enumerate_few(worst, 4)}. Adequate: at most {ADEQUATE:g}, or twice the noise.",
+        f"{enumerate_few(worst, 4)}. Adequate: at most {ADEQUATE:g} above {CHANCE:g} of the noise.",
     )
 
 

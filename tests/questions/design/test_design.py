@@ -588,3 +588,15 @@ def test_readings_of_own_deviations_and_inputs_that_are_words_have_no_further_on
     refused = replace(model, columns={"t": days})
     with patch.object(type(refused), "with_inputs", side_effect=ib.UserError("no such input")):
         assert design(replace(own, measurement=refused, noise=Gaussian(2.5))).further is None
+
+
+def test_more_readings_than_a_file_has_are_refused_with_what_to_do():
+    """One's own readings have no options that make room for more, and the answer has the next."""
+    model = ib.measurements.Formula(
+        "b1*(1-exp(-b2*t))", {"b1": 20.0, "b2": 0.5}, {"t": [1.0, 2.0, 3.0, 4.0]}
+    )
+    own = Scenario(model, Gaussian(1.0))
+    with pytest.raises(ib.UserError, match="remove the key: the answer says which two") as refused:
+        ib.design(own, readings=12)
+    assert "options" not in str(refused.value)
+    assert "What to read next" in str(ib.design(own))
