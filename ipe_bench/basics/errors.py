@@ -35,6 +35,10 @@ class StorageError(_Plain):
     """
 
 
+class Unsuited(Exception):
+    """Says in its own words why trials have no estimate."""
+
+
 def one_line(text: Any) -> str:
     """Returns the first line of a text, at most 1000 letters of it, with ? for what no file can
     hold."""
@@ -43,9 +47,11 @@ def one_line(text: Any) -> str:
 
 
 def describe_exception(error: BaseException) -> str:
-    """Describes an exception in one line for a table: its type and the first line of its
-    message."""
+    """Describes an exception in one line for a table: its type, unless its words suffice, and the
+    first line of its message."""
     line = one_line(error)
+    if isinstance(error, Unsuited):
+        return line
     if "read-only" in line:
         line += " (it writes into what it is given: work on a copy)"
     return f"{type(error).__name__}: {line}" if line else type(error).__name__

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Generic, Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.errors import Unsuited
 from ipe_bench.basics.linalg import (
     Array,
     Covariance,
@@ -80,6 +81,10 @@ class State:
 S = TypeVar("S", bound=State)
 
 
+class Rankless(Unsuited, np.linalg.LinAlgError):
+    """Signals that H has not full column rank."""
+
+
 @dataclass(frozen=True)
 class FrozenSystem:
     r"""Defines the nonlinear system of eqs. (11) and (19) for the trials `rows` of a batch.
@@ -103,10 +108,10 @@ class FrozenSystem:
         """Builds the paper's system: H about the start, for readings z (trials, m).
 
         Raises:
-            LinAlgError: H has not full column rank.
+            Rankless: H has not full column rank.
         """
         if problem.rankless:
-            raise np.linalg.LinAlgError(
+            raise Rankless(
                 f"measurement={problem.measurement.name}: H has not full column rank at the"
                 " start: some parameters cannot be distinguished there, so there is no"
                 " linear estimate to start from; give another start, start=nominal or best"

@@ -6,6 +6,7 @@ from shared.oracles import assert_agrees
 
 from ipe_bench.baselines import EKF, LevenbergMarquardt
 from ipe_bench.basics.linalg import Covariance
+from ipe_bench.estimators.base import estimate_safely
 from ipe_bench.measurements import Bearings
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
@@ -85,6 +86,10 @@ def test_a_problem_that_is_not_observable_is_refused(model):
     assert np.linalg.matrix_rank(model.linearization(), tol=1e-9) < 4
     with pytest.raises(np.linalg.LinAlgError, match=r"H has not full column rank"):
         Newton().estimate(problem(model), model.simulate(model.nominal[None]))
+    (said,) = estimate_safely(
+        Newton(), problem(model), model.simulate(model.nominal[None])
+    ).messages.values()
+    assert said.startswith("measurement=bearings: H has not full column rank")
 
 
 def test_a_turn_makes_it_observable():
