@@ -43,8 +43,8 @@ class AutoTracker(Tracker):
 
     Noise that depends on the states leaves no density to descend on: the more likely smoother of
     the two is the answer. A scalar state with process noise whose reading turns back among the
-    states that the extended filter predicts, as a square or a sine does, has its exact density on a
-    grid instead of all this; see `folded`.
+    states that the extended filter predicts, as a square or a sine does, or comes round there, has
+    its exact density on a grid instead of all this; see `folded`.
 
     Example:
 

@@ -1,5 +1,6 @@
-"""Tells where a filter by tangents misleads itself, since a reading turns back among the states
-that it predicts, hardly rises any more, or has other noise; the exact density is known there."""
+"""Tells where a filter by tangents misleads itself, since a reading turns back or comes round among
+the states that it predicts, hardly rises any more, or has other noise; the exact density is known
+there."""
 
 from __future__ import annotations
 
@@ -22,6 +23,9 @@ _SEEN = 1.0
 """Standard deviations of a reading that its steepest rise is at least, if it tells of the state."""
 _NOISES = 3.0
 """How many times the least standard deviation of a reading at these points the largest may be."""
+_ROUND = 0.6
+"""Part of its period through which a reading that comes round goes between these points at least:
+states a period apart are then 6.7 standard deviations apart at most, and both may be probable."""
 _POINTS = 200
 """Points of the grid of an epoch at least."""
 
@@ -71,7 +75,7 @@ def folded(model: StateModel, filtered: Tracks) -> Mask:
     """Tells in which trials (trials,) some reading of a scalar state is folded."""
     x = _predicted(model, filtered)
     seen = np.isfinite(filtered.innovations)
-    h = np.stack([model.epoch_functions[1].values(at) for at in x])
+    h, turns = _readings(model, x)
     rise = model.nearest(h[1:], h[:-1]) - h[:-1]
     deviation = _deviations(model, x)
     steepest = np.abs(rise).max(axis=0)
@@ -79,13 +83,14 @@ def folded(model: StateModel, filtered: Tracks) -> Mask:
     least = (rise * np.sign(rise.sum(axis=0))).min(axis=0)
     bent = (steepest > _SEEN * deviation.min(axis=0)) & ~(least >= _EVEN * steepest)
     unlike = deviation.max(axis=0) > _NOISES * deviation.min(axis=0)
-    return (seen & (bent | unlike)).any(axis=(1, 2))
+    return (seen & (bent | unlike | (turns > _ROUND))).any(axis=(1, 2))
 
 
 def calls(model: StateModel) -> float:
     """Counts the evaluations of f and of h that this takes of a trial."""
     slopes = 2 * (model.evaluations - model.epochs)
-    return float(slopes + len(_AMONG) * model.epochs)
+    of_reading = 2 if any(model.periods) else 1
+    return float(slopes + of_reading * len(_AMONG) * model.epochs)
 
 
 def _predicted(model: StateModel, filtered: Tracks) -> Array:
@@ -95,6 +100,21 @@ def _predicted(model: StateModel, filtered: Tracks) -> Array:
     Q = [_process(model, path[:, k], k) for k in range(model.epochs)]
     variance = F[..., 0] ** 2 * P[:, :-1, 0] + np.stack(Q, axis=1)
     return moved + _AMONG[:, None, None, None] * np.sqrt(variance)
+
+
+def _readings(model: StateModel, x: Array) -> tuple[Array, Array]:
+    """Returns readings (points, trials, K, m) of states x (points, trials, K, 1), and through how
+    many of its periods each goes between the first and the last of these, where it rises as at the
+    steepest of them."""
+    h = model.epoch_functions[1]
+    if not any(model.periods):
+        values = np.stack([h.values(at) for at in x])
+        return values, np.zeros(values.shape[1:])
+    values, slopes = map(np.stack, zip(*(h.slopes(at) for at in x), strict=True))
+    # Differences between points do not tell whole turns.
+    turn = np.where(model.periods, model.periods, np.inf)
+    way = np.abs(slopes[..., 0]).max(axis=0) * (x[-1] - x[0])
+    return values, way / turn
 
 
 def _process(model: StateModel, x: Array, k: int) -> Array:

@@ -121,6 +121,39 @@ def test_a_folded_reading_of_a_scalar_state_has_the_exact_density(model):
     np.testing.assert_allclose(found.covariance, exact.covariance, atol=1e-4)
 
 
+@pytest.mark.parametrize("spread", [0.5, 2.0, 2 * np.pi / 3])
+def test_a_reading_that_comes_round_among_scalar_states_has_the_exact_density(spread):
+    """By sums over 3,001 states: with the last of these spreads, states a standard deviation apart
+    have readings a whole turn apart, which look equal."""
+    phase = Formulas(
+        next={"x": "x + w"},
+        readings={"phase": "3*x"},
+        noise={"w": 0.2},
+        deviation={"phase": 0.3},
+        period={"phase": 2 * np.pi},
+        spread={"x": spread},
+        count=2,
+    )
+    z = phase.draw(0, 4).z
+    found = AutoTracker().track(phase, z)
+    np.testing.assert_array_equal(found.stage, EXACT)
+    x = np.linspace(-15, 15, 3001)
+    moved = np.exp(-0.5 * ((x[:, None] - x) / 0.2) ** 2)
+    for trial in range(4):
+        away = np.remainder(z[trial] - 3 * x + np.pi, 2 * np.pi) - np.pi
+        first, last = np.exp(-0.5 * (away / 0.3) ** 2)
+        p = last * (moved @ (first * (moved @ np.exp(-0.5 * (x / spread) ** 2))))
+        mean = p @ x / p.sum()
+        variance = p @ (x - mean) ** 2 / p.sum()
+        assert found.mean[trial, -1, 0] == pytest.approx(mean, abs=1e-3)
+        assert found.covariance[trial, -1, 0, 0] == pytest.approx(variance, rel=1e-3)
+
+
+def test_a_scalar_state_whose_readings_come_round_far_away_needs_no_grid():
+    phase = replace(SQUARE, readings={"z": "x"}, period={"z": 40.0}, spread={"x": 0.5})
+    assert (AutoTracker().track(phase, phase.draw(0, 20).z).stage != EXACT).all()
+
+
 def test_a_scalar_state_whose_readings_rise_evenly_needs_no_grid():
     for readings in ("x", "x + 0.1*x**2", "exp(x/3)", "(x + 20)**2/10"):
         model = replace(SQUARE, readings={"z": readings}, spread={"x": 0.5})
