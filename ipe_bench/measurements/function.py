@@ -227,7 +227,7 @@ class Function(WrittenModel):
     def _checked(self, z: Any, m: int | None) -> Any:
         if np.ndim(z) != 1 or m not in (None, len(z)):
             wanted = "one number per reading" + ("" if m is None else f", ({m},)")
-            shape = f"an array of shape {np.shape(z)}"
+            shape = "nothing" if z is None else f"an array of shape {np.shape(z)}"
             raise UserError(f"measurement.of={self.of}: returns {shape}; let it return {wanted}")
         return z
 

@@ -135,11 +135,13 @@ class ResultKey:
 
 def _about(model: Any) -> str:
     """Returns the first sentence of a model's docstring; empty if it has none."""
-    docstring = " ".join((type(model).__doc__ or "").split())
+    # An example may follow the first paragraph, and is no part of the sentence.
+    paragraph = (type(model).__doc__ or "").partition("\n\n")[0]
+    docstring = " ".join(paragraph.split())
     # What a dataclass writes where there is no docstring says nothing.
     if docstring.startswith(f"{type(model).__name__}("):
         return ""
-    return docstring.partition(". ")[0].rstrip(".")
+    return docstring.partition(". ")[0].rstrip(".:")
 
 
 def _of_states(scenario: AnyScenario) -> dict[str, Any]:

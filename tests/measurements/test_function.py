@@ -12,6 +12,7 @@ import ipe_bench as ib
 from ipe_bench.cli.main import main
 from ipe_bench.measurements import Formula, function
 from ipe_bench.runs.provenance import fingerprint
+from ipe_bench.runs.store import _about
 
 T = np.linspace(0.1, 4.0, 25)
 LAW = """
@@ -81,6 +82,9 @@ def warning(t, k=1.0):
 
 def of_a_date(t, a=2.0, b=1.0):
     return a * np.exp(-b * t)
+
+def silent(t, k=1.0):
+    k * t
 
 def no_parameter(t):
     return t
@@ -279,6 +283,17 @@ def test_another_shape_is_refused_by_the_function_s_name(laws, name):
         ib.UserError, match=f"measurement.of=some_laws:{name}: returns an array of shape"
     ):
         model(name).simulate(np.array([[1.0], [1.1]]))
+
+
+def test_a_forgotten_return_is_said(laws):
+    with pytest.raises(ib.UserError, match="returns nothing; let it return one number per"):
+        model("silent").simulate(np.array([[1.0], [1.1]]))
+
+
+def test_a_report_introduces_a_function_without_the_example_of_its_class(laws):
+    assert _about(model("swing")) == (
+        "Computes z = h(parameters, columns), for a function h of a Python file"
+    )
 
 
 def test_what_the_function_raises_is_one_line_with_its_place(laws, capsys):
