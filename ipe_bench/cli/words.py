@@ -235,11 +235,15 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
     try:
         found = OverridesParser.create().parse_override(word)
     except (HydraException, ValueError, RecursionError):
+        if any(value.count(one) != value.count(other) for one, other in ("[]", "{}", "()")):
+            raise UserError(
+                f"{word}: the brackets do not match; close each, and quote the whole word if it"
+                " contains blanks"
+            ) from None
         raise UserError(
             f"{word}: the value cannot be read; a text with other signs than letters, digits"
             " and -_./:% needs quotes "
-            f'that reach ipe-bench, such as "{key}={quoted(value)}", and brackets'
-            " have to be closed"
+            f'that reach ipe-bench, such as "{key}={quoted(value)}"'
         ) from None
     if not found.key_or_group:
         raise UserError(f"{word}: there is no key in front of the value; write KEY=VALUE")

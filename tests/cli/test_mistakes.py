@@ -267,9 +267,15 @@ def stored(folder: Path) -> list[Path]:
         ),
         ("solver=newton,auto", "solver=newton,auto: is a sweep; add -m, or put a list in brackets"),
         ("-m hydra.sweeper.params={error_scale:1}", "give each key by itself, as in hydra.sweep"),
+        ("solver=[newton, auto]", "solver=[newton,: the brackets do not match; close each, and"),
+        ("solver.x={a:1", "the brackets do not match; close each, and quote the whole word"),
+        (
+            "solver=newton&auto",
+            "needs quotes that reach ipe-bench, such as \"solver='newton&auto'\"",
+        ),
     ],
 )
-def test_a_sweep_in_a_wrong_place_is_told_a_right_one(answer, words, line):
+def test_a_word_that_cannot_be_read_is_told_a_right_one(answer, words, line):
     code, (said,) = answer("run", *words.split())
     assert code == 2
     assert line in said
