@@ -518,7 +518,7 @@ class _Reader:
                 words.append(f"{group}.{key}.{name}=1")
         if not said:
             return
-        remedy = f"write them there, or: {self._again(*words)}"
+        remedy = f"add each to the file, or: {self._again(*words)}"
         if misnamed:
             remedy = f"its keys are {', '.join(options)}"
         raise UserError(f"{file}: {'; '.join(said)}; {remedy}")

@@ -113,8 +113,7 @@ class ConstrainedModel(WrappedModel):
             if not lower < v0 < upper:
                 key = f"parameters.{one.name}"
                 raise UserError(
-                    f"{key}: its start, {v0:g}, is not inside of its bounds; give"
-                    f" {key}.nominal=VALUE"
+                    f"{key}: its start, {v0:g}, is not inside its bounds; give {key}.nominal=VALUE"
                 )
         if not len(self._free):
             raise UserError("parameters: all are fixed; leave at least one to be estimated")

@@ -132,7 +132,7 @@ class Question:
                 lacking.append(f"estimators.{label}: {why}; leave it out")
             elif estimator.hindrance(self.problem):
                 lacking.append(
-                    f"estimators.{label}: needs prior, which is not stated; give error_scale=X,"
+                    f"estimators.{label}: needs a prior, which is not stated; give error_scale=X,"
                     " the standard deviation of the parameters in multiples of their sizes"
                 )
         if lacking:

@@ -324,7 +324,11 @@ def open_together(
     there = int(np.isfinite(found.z).sum())
     if there < model.n:
         shown = str(paths[0]) if len(paths) == 1 else f"[{','.join(map(str, paths))}]"
-        raise UserError(f"readings={shown}: {there} readings are too few for {model.n} parameters")
+        count = "1 reading is" if there == 1 else f"{there} readings are"
+        raise UserError(
+            f"readings={shown}: {count} too few for {model.n} parameters; take more readings, or"
+            " fix a parameter by parameters.NAME.fixed=VALUE"
+        )
     files = tuple((str(table.path), table.digest) for table in tables)
     return replace(found, model=model, files=files)
 

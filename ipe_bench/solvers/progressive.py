@@ -172,9 +172,9 @@ def _same(one: Minima, other: Minima) -> Mask:
 def _words(tried: int, drawn: int, repeats: int) -> str:
     """Says how far the search went in a trial."""
     count = "1 more attempt" if tried == 1 else f"{tried} more attempts"
-    draws = f", from {drawn} independent draws in all" if drawn else ""
-    led = f"{repeats} of them led to this minimum again" if repeats else "none found one"
-    return f"a better fit was looked for by {count}{draws}: {led}"
+    draws = f" from {drawn} independent draws" if drawn else ""
+    led = f"{repeats} led to this minimum again" if repeats else "none found one"
+    return f"{count}{draws} looked for a better fit; {led}"
 
 
 def accepted(minima: Minima, readings: int, significance: float) -> Mask:

@@ -157,7 +157,7 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
         ),
         (
             ["bare.yaml", "log.csv"],
-            "deviation is missing; spread is missing; w is not defined; write them there, or:"
+            "deviation is missing; spread is missing; w is not defined; add each to the file, or:"
             " ipe-bench estimate bare.yaml log.csv 'state_model.deviation={z: 1}'"
             " 'state_model.spread={x: 1}' state_model.noise.w=1",
         ),

@@ -155,9 +155,7 @@ def test_what_is_not_there_is_neither_known_nor_left_out(files, known, without, 
 
 def test_fewer_readings_than_parameters_are_refused(tmp_path):
     (tmp_path / "a.csv").write_text("t,y\n1,2\n2,\n3,\n")
-    with pytest.raises(
-        UserError, match=r"readings=.*a.csv: 1 readings are too few for 2 parameters"
-    ):
+    with pytest.raises(UserError, match=r"readings=.*a.csv: 1 reading is too few for 2 parameters"):
         open_together([tmp_path / "a.csv"], OWN)
 
 

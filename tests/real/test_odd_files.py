@@ -133,7 +133,7 @@ REFUSED = {
     "empty": (b"", "is empty"),
     "a mark and nothing else": ("\ufeff".encode(), "is empty"),
     "no header": (text(*GOOD[1:]), "the first row has only numbers and is no header; write"),
-    "two readings": (text(*GOOD[:2]), "1 readings are too few for 2 parameters"),
+    "two readings": (text(*GOOD[:2]), "1 reading is too few for 2 parameters"),
     "tabs and decimal commas": (
         WHOLE.replace(",", "\t").replace(".", ",").encode(),
         "row 2, column y: '-1,25' is not a number",

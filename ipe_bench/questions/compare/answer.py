@@ -97,8 +97,8 @@ class Comparison(Shown, pd.DataFrame):
             "error is the length of the error of all parameters, in standard deviations of the"
             " bound (Mahalanobis), at most the radius of the gate of success; cost counts"
             " simulations. Both are means over the common trials; the table of a run has medians,"
-            f" and errors over the bound. {tests} Each interval holds"
-            " for its row alone. Times are not tested. Between an estimator with a prior and one"
+            f" and errors over the bound. {tests} Each interval is"
+            " for its row only. Times are not tested. Between an estimator with a prior and one"
             " without, success is by the gate of the Cramér-Rao bound; in the table of a run each"
             " has the gate of its own bound."
         )

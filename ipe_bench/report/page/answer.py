@@ -194,8 +194,8 @@ class Answer(Labelled[Fit]):
         for one in self._lacking[:1]:
             what = "; ".join(one.undetermined)
             yield Strong(
-                f"The readings do not determine {what} (at {one.label}); fix parameters, or give"
-                " prior, until they do."
+                f"The readings do not determine {what} (at {one.label}); fix a parameter by"
+                " parameters.NAME.fixed=VALUE, or take more readings."
             )
         if self._lacking or not self.passes:
             for name, value in nearer_starts(self.model, self.z).items():
@@ -274,7 +274,7 @@ class Answer(Labelled[Fit]):
         if self.by_profile:
             return (
                 f"In parentheses: {100 * CONFIDENCE:.0f} % profile intervals. Use them in place of"
-                " standard errors, for the model is strongly nonlinear here."
+                " standard errors, because the model is strongly nonlinear here."
             )
         return "" if self._stated.exact else "Estimates ± standard errors."
 

@@ -225,8 +225,8 @@ def write_page(
         answer.parts(),
         draw_log(log, answer.tracks, name) if figures else (),
         lead=(
-            "A model fits if innovations, readings less predictions, are as large as it says and do"
-            " not resemble each other."
+            "A model fits if innovations (readings minus predictions) are as large as it predicts"
+            " and do not resemble each other."
         ),
         facts=[f"{readings} readings at {log.model.epochs} epochs"],
         sources=read_from(provenance),
@@ -276,7 +276,7 @@ def _facts(answer: LogAnswer) -> list[str]:
             told.append(
                 Fact(
                     "Successive innovations",
-                    f"they resemble each other {alike} chance explains: p {p_value(one.white_p)}.",
+                    f"They resemble each other {alike} chance explains: p {p_value(one.white_p)}.",
                 )
             )
     gated = [one for one in answer if one.share_gated > 0]
