@@ -222,7 +222,7 @@ def test_without_trackers_they_are_those_of_the_command(monkeypatch, find):
     [
         ((np.zeros(3),), {}, "give the 40 readings"),
         (("nowhere.csv",), {}, "no such file"),
-        ((np.zeros(40), {"map": ib.baselines.MapLM()}), {}, "needs prior"),
+        ((np.zeros(40), {"map": ib.baselines.MapLM()}), {}, "needs a prior"),
         ((np.full(40, np.nan),), {}, "all are missing"),
         ((np.full(40, np.inf),), {}, "inf is not a reading"),
         ((np.full(40, 1j),), {}, "are complex; give real numbers"),
