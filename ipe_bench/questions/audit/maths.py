@@ -13,7 +13,7 @@ import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import permutations
+from itertools import permutations, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 FEWEST_RUNS = 20
 MOST_COLUMNS = 4096
+_SEPARATORS = ",;\t| "
 MATTERS = 1.1
 """A factor of the standard deviation below which a covariance can be believed."""
 _DRAWS = 1999
@@ -285,8 +286,8 @@ def _with_infinite_errors(claims: Claims, lost: NDArray[np.bool_]) -> Audit:
 
 
 def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
-    """Words the finding on the scale; if it is undecided, with the number of runs in which a
-    standard deviation that is wrong by 10 % is seen in four of five cases."""
+    """Words the finding on the scale; if it is undecided and the runs are fewer, with the
+    number in which a standard deviation that is wrong by 10 % is seen in four of five cases."""
     if scale.wrong:
         only = "" if scale.value > 1 else "only "
         return f"True errors are {only}{scale.words}: the covariance is {scale.verdict}."
@@ -298,6 +299,11 @@ def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
     spread = float(mean.var(ddof=1) / mean.mean() ** 2)
     errors = ndtri(1 - ALPHA / 4) + ndtri(0.8)
     needed = np.ceil(spread * (errors / (2 * np.log(MATTERS))) ** 2)
+    if needed <= claims.runs:
+        return (
+            f"True errors are {scale.words}: {claims.runs} runs show neither that the covariance"
+            " is right nor that it is wrong."
+        )
     return (
         f"True errors are {scale.words}: {claims.runs} runs are too few to judge the covariance; a"
         " standard deviation that is wrong by 10 % would be detected in"
@@ -444,7 +450,7 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
 
     if isinstance(table, pd.DataFrame):
         name = "the frame"
-        frame = table
+        frame = table.reset_index(drop=True)
     else:
         name = str(table)
         frame = _read(Path(table))
@@ -463,12 +469,14 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
     ]
     error, deviation = np.array(stated).transpose(1, 2, 0)
     there = ~np.isnan(error).any(axis=1) & finite(deviation)
-    _require_deviations(deviation, there, names, name)
+    if "run" in frame:
+        there &= frame["run"].notna().to_numpy()
+    _require_deviations(frame, deviation, there, names, name)
     correlation = _correlation(frame, names, deviation, name)
     rows = np.flatnonzero(there)
     if correlation is not None:
         correlation = correlation[rows]
-        _require_positive(correlation, rows, name)
+        _require_positive(frame, correlation, rows, name)
     run = np.arange(len(rows))
     if "run" in frame:
         run, _ = pd.factorize(frame["run"].iloc[rows])
@@ -477,9 +485,14 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
     return Claims(names, error[rows], deviation[rows], correlation, run, left_out)
 
 
-def _place(name: str, row: int) -> str:
-    """Names a row by its line in a file, the first of which is the header."""
-    return f"{name}: row {row + 2}"
+def _place(frame: pd.DataFrame, row: int, name: str) -> str:
+    """Names a row by its line in a file, the first of which is the header, or by what a table that
+    was long has as its index: the run."""
+    keys = frame.index.names
+    if keys == [None]:
+        return f"{name}: row {row + 2}"
+    values = frame[list(keys)].iloc[row]
+    return f"{name}: {', '.join(f'{key} {value}' for key, value in zip(keys, values, strict=True))}"
 
 
 def _parameters(frame: pd.DataFrame) -> tuple[str, ...]:
@@ -492,7 +505,7 @@ def _parameters(frame: pd.DataFrame) -> tuple[str, ...]:
 
 
 def _require_deviations(
-    deviation: Array, there: NDArray[np.bool_], names: Sequence[str], name: str
+    frame: pd.DataFrame, deviation: Array, there: NDArray[np.bool_], names: Sequence[str], name: str
 ) -> None:
     """Refuses claims (rows, n) of which no row is `there` (rows,), and deviations of 0 or less."""
     if not there.any():
@@ -503,16 +516,18 @@ def _require_deviations(
     bad = np.argwhere(there[:, None] & ~(deviation > 0))
     if len(bad):
         row, i = bad[0]
-        raise UserError(f"{_place(name, row)}: the deviation of {names[i]} is not above 0")
+        raise UserError(f"{_place(frame, row, name)}: the deviation of {names[i]} is not above 0")
 
 
-def _require_positive(correlation: Array, rows: NDArray[np.intp], name: str) -> None:
+def _require_positive(
+    frame: pd.DataFrame, correlation: Array, rows: NDArray[np.intp], name: str
+) -> None:
     """Refuses correlations (rows, n, n), of those rows of the table, that are none."""
     good = finite(correlation)
     good[good] = np.linalg.eigvalsh(correlation[good])[:, 0] > 1e-12
     if not good.all():
         row = rows[np.argmin(good)]
-        raise UserError(f"{_place(name, row)}: the covariance is not positive definite")
+        raise UserError(f"{_place(frame, row, name)}: the covariance is not positive definite")
 
 
 def _read(path: Path) -> pd.DataFrame:
@@ -538,9 +553,9 @@ def _separator(path: Path) -> str:
         heading = next((line for line in file if line.strip()), "")
     if not heading:
         raise UserError(f"{path}: is empty; give a table with a header and a row per run")
-    _refuse_many(1 + max(map(heading.count, ",;\t|")), str(path), "columns")
+    _refuse_many(1 + max(map(heading.count, _SEPARATORS)), str(path), "columns")
     try:
-        return csv.Sniffer().sniff(heading).delimiter
+        return csv.Sniffer().sniff(heading, _SEPARATORS).delimiter
     except csv.Error:
         return ","
 
@@ -574,14 +589,17 @@ def _numbers(frame: pd.DataFrame, column: str, name: str) -> Array:
     bad = np.flatnonzero(values.isna() & frame[column].notna())
     if len(bad):
         raise UserError(
-            f"{_place(name, bad[0])}, column {column}: '{frame[column].iloc[bad[0]]}' is not a"
-            " number; write it with a decimal point, or leave the cell empty"
+            f"{_place(frame, bad[0], name)}, column {column}: '{frame[column].iloc[bad[0]]}' is not"
+            " a number; write it with a decimal point, or leave the cell empty"
         )
     return frame[column].to_numpy(float, na_value=np.nan)
 
 
 def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
-    """Converts a table with a row per run and parameter to one with a row per run."""
+    """Converts a table with a row per run and parameter to one with a row per run,
+    which the index names."""
+    import pandas as pd
+
     values = [c for c in ("true", "estimate", "error", "std", "var") if c in frame]
     index = [c for c in frame.columns if c not in (*values, "parameter")]
     if not index:
@@ -589,12 +607,24 @@ def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     twice = frame.duplicated([*index, "parameter"]).to_numpy()
     if twice.any():
         row = int(np.argmax(twice))
-        raise UserError(f"{_place(name, row)}: a parameter is given twice in {', '.join(index)}")
-    numbers = {column: _numbers(frame, column, name) for column in values}
-    frame = frame.assign(**numbers)
-    wide = frame.pivot_table(index=index, columns="parameter", values=values, sort=False)
-    wide.columns = [p if value == "estimate" else f"{p}_{value}" for value, p in wide.columns]
-    return wide.reset_index()
+        raise UserError(
+            f"{_place(frame, row, name)}: a parameter is given twice in {', '.join(index)}"
+        )
+    nameless = (frame["parameter"].isna() & frame[values].notna().any(axis=1)).to_numpy()
+    if nameless.any():
+        row = int(np.argmax(nameless))
+        raise UserError(f"{_place(frame, row, name)}: has no parameter; name it")
+    numbers = pd.DataFrame({column: _numbers(frame, column, name) for column in values})
+    group = frame.groupby(index, sort=False, dropna=False).ngroup().to_numpy()
+    # `pivot_table` would drop rows with an empty key.
+    wide = numbers.set_index([group, frame["parameter"]]).unstack()  # noqa: PD010
+    parameters = frame["parameter"].dropna().unique()
+    named = frame[index].drop_duplicates(ignore_index=True)
+    for value, p in product(values, parameters):
+        column = wide[value, p]
+        if column.notna().any():
+            named[p if value == "estimate" else f"{p}_{value}"] = column
+    return named.set_index(index, drop=False)
 
 
 def _error(frame: pd.DataFrame, parameter: str, name: str) -> Array:
@@ -626,7 +656,7 @@ def _deviation(frame: pd.DataFrame, parameter: str, name: str) -> Array:
         bad = np.flatnonzero(np.abs(other - deviation) > 0.01 * np.abs(deviation))
         if len(bad):
             raise UserError(
-                f"{_place(name, bad[0])}: {first} and {column} differ; give one of them"
+                f"{_place(frame, bad[0], name)}: {first} and {column} differ; give one of them"
             )
     return deviation
 
@@ -651,8 +681,8 @@ def _correlation(
             bad = np.flatnonzero(np.abs(found[:, i, j] - value) > 1e-6)
             if len(bad):
                 raise UserError(
-                    f"{_place(name, bad[0])}: {stated[j, i]} and {column} differ; a covariance is"
-                    " symmetric, so give one of them"
+                    f"{_place(frame, bad[0], name)}: {stated[j, i]} and {column} differ; a"
+                    " covariance is symmetric, so give one of them"
                 )
         found[:, i, j] = value
         found[:, j, i] = value

@@ -417,3 +417,67 @@ def test_a_parameter_with_infinite_errors_is_the_worst_and_has_a_page(tmp_path, 
     assert f"in {rows} of 40 runs" in str(found)
     assert "nan" not in str(found)
     assert (tmp_path / "audit.html").is_file()
+
+
+def test_an_undecided_audit_of_enough_runs_does_not_call_them_too_few():
+    """An interval from 1.00 to 1.10 leaves both open, although 1000 runs would detect 1.10."""
+    error = 1.05 * norm.ppf((np.arange(1000) + 0.5) / 1000)[:, None]
+    found = audit(Claims(("a",), error, np.ones((1000, 1)), None, np.arange(1000)))
+    assert found.verdict == "undecided"
+    assert found.sentences[0].endswith(
+        "1000 runs show neither that the covariance is right nor that it is wrong."
+    )
+
+
+def long_table(changed):
+    """Returns 25 runs of two parameters, with some rows as they are `changed`."""
+    rows = {(run, p): f"{run},{p},0,{run - 12.0},8" for run in range(25) for p in "ab"}
+    return "\n".join(["run,parameter,true,estimate,std", *(rows | changed).values(), ""])
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({(3, "b"): "3,b,0,1,-1"}, "run 3: the deviation of b is not above 0"),
+        ({(3, "b"): "3,b,0,1,x"}, "row 9, column std: 'x' is not a number"),
+        ({(3, "b"): "3,,0,1,8"}, "row 9: has no parameter"),
+    ],
+)
+def test_an_error_names_the_run_or_the_row_of_a_long_table(tmp_path, changed, said):
+    path = tmp_path / "long.csv"
+    path.write_text(long_table(changed))
+    with pytest.raises(UserError, match=said):
+        read_claims(path)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {(0, "a"): ",a,0,1,8", (0, "b"): ",b,0,1,8"},
+        {(0, "a"): "0,a,,,", (0, "b"): "0,b,,,"},
+        {(0, "a"): "0,a,0,,", (0, "b"): "0,b,0,,"},
+    ],
+    ids=["no run", "nothing at all", "no estimate"],
+)
+def test_a_run_of_a_long_table_that_says_nothing_is_counted(tmp_path, changed):
+    path = tmp_path / "long.csv"
+    path.write_text(long_table(changed))
+    found = read_claims(path)
+    assert (found.runs, found.left_out) == (24, 1)
+    assert found.names == ("a", "b")
+
+
+def test_rows_of_a_wide_table_without_a_run_are_left_out_and_not_one_run():
+    runs = [None, None, *range(20)]
+    found = read_claims(pd.DataFrame({"run": runs, "a_error": np.arange(22.0), "a_std": 8.0}))
+    assert (found.runs, found.left_out) == (20, 2)
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", "|", " "])
+def test_a_header_is_split_at_separators_alone(tmp_path, separator):
+    """Letters and underscores repeat as evenly in a header as its separator does."""
+    path = tmp_path / "claims.csv"
+    lines = [("run", "k_true", "k", "k_std"), *((str(i), "0", "1", "2") for i in range(20))]
+    path.write_text("\n".join(map(separator.join, lines)))
+    found = read_claims(path)
+    assert (found.names, found.runs) == (("k",), 20)
