@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from annotated_types import BaseMetadata, Ge, Gt, Le, Lt, MinLen, Predicate
+from annotated_types import BaseMetadata, Ge, GroupedMetadata, Gt, Le, Lt, MinLen, Predicate
 
 from ipe_bench.basics.errors import UserError, describe_exception, shortened, unknown
 
@@ -63,6 +63,7 @@ _NOUNS = {
     bool: "true or false",
     str: "a text",
     type(None): "null",
+    Sequence: "a list",
 }
 
 
@@ -219,10 +220,14 @@ def checked(value: Any, hint: Any, key: str) -> Any:
     # True and false are not numbers; NumPy's are.
     abstract = {int: numbers.Integral, float: numbers.Real}.get(plain)
     if abstract and isinstance(value, abstract) and not isinstance(value, bool):
-        return value if type(value) is plain else typing.cast(Any, plain)(value)
+        try:
+            return value if type(value) is plain else typing.cast(Any, plain)(value)
+        except OverflowError:  # a whole number beyond every float
+            raise _refusal(value, describe_type(hint), key) from None
     if plain is Sequence and isinstance(value, list | np.ndarray):
         return tuple(value.tolist() if isinstance(value, np.ndarray) else value)
-    if isinstance(value, plain) and not abstract:
+    is_text = plain is Sequence and isinstance(value, str | bytes)
+    if isinstance(value, plain) and not abstract and not is_text:
         return value
     raise _refusal(value, describe_type(hint), key)
 
@@ -251,7 +256,13 @@ def _holds(bound: Any, value: Any) -> bool:
 
 def _bounds(metadata: Sequence[Any]) -> list[Any]:
     """Returns the constraints among an annotation's metadata."""
-    bounds = [item for item in metadata if isinstance(item, BaseMetadata)]
+    bounds: list[Any] = []
+    for item in metadata:
+        # Interval and Len are made of others.
+        if isinstance(item, GroupedMetadata):
+            bounds += _bounds(list(item))
+        if isinstance(item, BaseMetadata):
+            bounds.append(item)
     for bound in bounds:
         if type(bound) not in _COMPARISONS:
             raise TypeError(f"{bound}: is a constraint that options cannot have; write a Predicate")
@@ -314,7 +325,11 @@ def describe_type(hint: Any) -> str:
             "a finite number" if FINITE in arguments and not bounds else describe_type(arguments[0])
         )
         limits = [dataclasses.astuple(bound)[0] for bound in bounds]
-        return _BOUNDED[tuple(map(type, bounds))].format(noun, *limits)
+        kinds = tuple(map(type, bounds))
+        if kinds in _BOUNDED:
+            return _BOUNDED[kinds].format(noun, *limits)
+        each = [_BOUNDED[kind,].format("", end) for kind, end in zip(kinds, limits, strict=True)]
+        return noun + " and".join(each)
     if origin in (typing.Union, types.UnionType):
         return " or ".join(map(describe_type, arguments))
     if origin is typing.Literal:

@@ -7,14 +7,14 @@ import copy
 import dataclasses
 import operator
 import pickle
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
 import yaml
-from annotated_types import Ge, Gt, Le, Lt, MinLen
+from annotated_types import Ge, Gt, Interval, Le, Len, Lt, MinLen
 from omegaconf import OmegaConf
 
 from ipe_bench.baselines import EKF, LevenbergMarquardt
@@ -274,3 +274,29 @@ def test_a_component_keeps_dictionaries_of_its_own_that_nobody_edits():
     for same in (pickle.loads(pickle.dumps(first)), copy.deepcopy(first), replace(first)):
         assert same == first
     assert replace(first, constants=shared).constants == {"rate": 0.9}
+
+
+@pytest.mark.parametrize(
+    ("value", "hint", "said"),
+    [
+        (5.0, Annotated[float, Interval(gt=0, lt=1)], "a number between 0 and 1"),
+        ((), Annotated[tuple[float, ...], Len(1)], "a list of at least 1"),
+        (2, Annotated[float, Lt(1), Gt(0)], "a number below 1 and above 0"),
+        (-7, Annotated[int, Ge(0), Le(5), Lt(4)], "a whole number from 0 up and up to 5 and below"),
+        ("abc", Sequence[float], "a list"),
+        (b"abc", Sequence, "a list"),
+        (10**400, float, "a number"),
+        (10**400, Positive, "a number above 0"),
+    ],
+    ids=["Interval", "Len", "upper first", "three", "text", "bytes", "giant", "positive giant"],
+)
+def test_a_constraint_made_of_others_a_text_and_a_giant_are_refused(
+    value: Any, hint: Any, said: str
+) -> None:
+    with pytest.raises(UserError, match=f"give {said}"):
+        checked(value, hint, "key")
+
+
+def test_what_meets_a_constraint_made_of_others_is_taken() -> None:
+    assert checked(1, Annotated[float, Interval(ge=0, le=1)], "key") == 1.0
+    assert checked([1, 2], Sequence[int], "key") == (1, 2)
