@@ -90,6 +90,18 @@ def test_two_answers_that_fit_are_both_truths() -> None:
     assert hardest(found).claims[0].held == 0
 
 
+def test_answers_beyond_three_are_said_to_be_left_out() -> None:
+    """The slope is 4 at a = 1, 2, ..., 5."""
+    z = 4.0 * T + 0.3 * np.random.default_rng(1).standard_normal(len(T))
+    slope = "4 + (a - 1)*(a - 2)*(a - 3)*(a - 4)*(a - 5)"
+    found = own(asked(f"({slope})*t + 0.001*a", {"a": 3.2}, z, error_scale=1.0), LEAST_SQUARES, 5)
+    assert len(found.points) == 3
+    number = 3 + found.further
+    assert found.further >= 1
+    assert f"whichever of the best 3 of {number} answers that fit is right" in headline(found)
+    assert any(f"have {number} answers that fit: " in one for one in sentences(found))
+
+
 @dataclass(frozen=True)
 class Turned(ib.Estimator):
     """Gives the answer of least squares with the other sign in every second trial."""

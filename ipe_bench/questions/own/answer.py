@@ -137,7 +137,10 @@ def headline(own: Own) -> str:
     noun = "logs" if own.moving else "data sets"
     several = ""
     if len(own.points) > 1:
-        several = f", whichever of {len(own.points)} answers that fit is right"
+        number = f"{len(own.points)}"
+        if own.further:
+            number = f"the best {number} of {len(own.points) + own.further}"
+        several = f", whichever of {number} answers that fit is right"
     return f"On {own.trials} simulated {noun} like yours{several}: {advice(own, hardest(own))}"
 
 
@@ -145,7 +148,8 @@ def sentences(own: Own) -> Iterator[str]:
     """Yields what else is to be said, the gravest first."""
     if len(own.points) > 1:
         each = [f"were {point.words} right, {advice(own, point)}" for point in own.points]
-        yield f"Your data have {len(own.points)} answers that fit: {'. And '.join(each)}."
+        number = len(own.points) + own.further
+        yield f"Your data have {number} answers that fit: {'. And '.join(each)}."
     worst = hardest(own)
     yield from _cheaper(own, worst)
     told = list(_told_a_prior(own, worst))

@@ -103,6 +103,8 @@ class Own:
     """Estimators that do not suit the data, and why."""
     moving: bool = False
     """Whether the data are a log of states that move."""
+    further: int = 0
+    """Answers that fit, beyond the points, at which nothing was simulated."""
 
 
 @dataclass(frozen=True)
@@ -164,13 +166,16 @@ def own(
             left_out[label] = why
     kept = {label: one for label, one in estimators.items() if label not in left_out}
     points = []
-    for truth in _truths(fit, examination, problem):
+    truths = _truths(fit, examination, problem)
+    for truth in truths[:MOST_POINTS]:
         z = _drawn(fit, problem, truth.x, trials, seed)
         claims = _claims(fit, problem, kept, truth, z, watch)
         values = problem.measurement.physical(truth.x[None])[0].tolist()
         names = [p.name for p in problem.measurement.physical_parameters]
         points.append(Point(dict(zip(names, values, strict=True)), claims))
-    return Own(trials, points, _noise_in_words(problem), question.has_prior, left_out)
+    more = len(truths) - len(points)
+    noise = _noise_in_words(problem)
+    return Own(trials, points, noise, question.has_prior, left_out, further=more)
 
 
 def _at_least(fit: Fit, examination: Examination | None) -> Problem:
@@ -206,7 +211,7 @@ def _truths(fit: Fit, examination: Examination | None, problem: Problem) -> list
             found[same[0]] = _Truth(x, (*found[same[0]].copies, x))
         elif x is not estimate or not found:
             found.append(_Truth(x, (x,)))
-    return found[:MOST_POINTS]
+    return found
 
 
 def _same_curve(problem: Problem, x: Array, y: Array) -> bool:
