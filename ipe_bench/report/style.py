@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, cast, get_args
 from zlib import crc32
 
@@ -196,20 +196,25 @@ def looks(
     its face, or a place of the pool in the colours of its kind.
 
     Of two labels from elsewhere that chance gives one place, the later takes the next. What follows
-    a name in brackets changes marker and dash alone.
+    a name in brackets changes marker and dash alone. Two labels share a look where all of a family
+    are taken.
     """
     found: dict[str, Look] = {}
     for label in labels:
         name = _ALIKE.get(label, label)
         color, marker = (own or {}).get(label, (None, None))
-        variant = FACES.get(name.partition(" (")[0])
-        if variant and not color:
-            color = variant.color
+        face = FACES.get(name.partition(" (")[0])
+        if face and color:
+            face = replace(face, color=color)
+        if face:
+            color = face.color
         kind = (kinds or {}).get(label, "")
         family = (color,) if color else FAMILIES.get(kind, COLORS)
         place = _place(name)
-        look = FACES.get(name) or _from_pool(place, family)
-        while look in found.values():
+        look = face if face and name in FACES else _from_pool(place, family)
+        for _ in range(len(MARKERS) * len(DASHES) * len(family)):
+            if look not in found.values():
+                break
             place += 1
             look = _from_pool(place, family)
         found[label] = Look(look.color, marker or look.marker, look.dash)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from importlib import resources
 from typing import Any
 
@@ -27,7 +28,7 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.log import draw_log
 from ipe_bench.report.figures.svg import LEAST_LETTERS
 from ipe_bench.report.page.answer import _drawings
-from ipe_bench.report.style import COLORS, DARK, FACES, dark, house_style
+from ipe_bench.report.style import COLORS, DARK, FACES, dark, house_style, looks
 from ipe_bench.states import Smoother, ekf
 from ipe_bench.statistics import analyse
 from ipe_bench.trials.paths import StateScenario
@@ -178,3 +179,16 @@ def test_words_of_a_page_are_read_on_each_of_its_grounds():
     assert not re.search(r"[{; ]color: var\(--(faint|line)\)", css)
     sizes = [16 * float(size) for size in re.findall(r"font-size: (\d*\.\d+)rem", css)]
     assert min(sizes) >= LEAST_LETTERS
+
+
+def test_a_label_has_its_own_colour_although_it_has_a_face() -> None:
+    own = {"ekf": ("#123456", None)}
+    assert looks(["ekf", "ekf (1)"], own={**own, "ekf (1)": ("#654321", None)}) == {
+        "ekf": replace(FACES["ekf"], color="#123456"),
+        "ekf (1)": replace(looks(["ekf (1)"])["ekf (1)"], color="#654321"),
+    }
+
+
+def test_more_variants_than_there_are_looks_share_some() -> None:
+    found = looks([f"ekf (a={i})" for i in range(50)])
+    assert len(set(map(repr, found.values()))) == 44
