@@ -37,7 +37,7 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
         reason = error.strerror if error.errno is None else os.strerror(error.errno)
         raise StorageError(
             f"{path.parent}: cannot be written to any more ({reason or error}); earlier results are"
-            " intact; run the same command to resume"
+            " intact; run the same command again"
         ) from error
     finally:
         with contextlib.suppress(OSError):

@@ -58,7 +58,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _door(stream: Any) -> Any:
-    return stream and VisibleStream(stream)
+    # A program without a terminal, such as pythonw, has none.
+    return VisibleStream(io.StringIO() if stream is None else stream)
 
 
 def _answer(words: list[str]) -> int:
@@ -94,10 +95,8 @@ def _explain(error: BaseException, command: Sequence[str]) -> tuple[int, str]:
         reason = error.strerror or str(error)
         where = "a file" if error.filename is None else shortened(str(error.filename))
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return (
-                1,
-                f"{where}: {reason}; earlier results are intact; run the same command to resume",
-            )
+            remedy = "free some space and run the same command again"
+            return 1, f"{where}: {reason}; earlier results are intact; {remedy}"
         return (
             2,
             f"{where}: cannot be used ({reason}); choose another file or folder, for results with"

@@ -253,7 +253,7 @@ class Examination:
         """
         draws = self._affordable(self.bootstraps)
         unknown = np.full(len(self.x), np.nan)
-        if draws < min(_FEWEST_DRAWS, self.bootstraps):
+        if draws < max(1, min(_FEWEST_DRAWS, self.bootstraps)):
             return BootstrapIntervals(unknown, unknown, 0, 0)
         z = self._present + self._drawn_noise(draws)
         free = self.released

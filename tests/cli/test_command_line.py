@@ -1,5 +1,6 @@
 """The command line end to end: what it computes, and one clear line for every mistake."""
 
+import errno
 import json
 import os
 import re
@@ -16,7 +17,7 @@ import yaml
 import ipe_bench as ib
 from ipe_bench.basics.options import Count, Whole
 from ipe_bench.cli.keys import ROWS, WHOLE
-from ipe_bench.cli.main import COMMANDS, main
+from ipe_bench.cli.main import COMMANDS, _explain, main
 from ipe_bench.cli.run import Outcome
 from ipe_bench.cli.spec import KEYS, PARTS, Spec
 from ipe_bench.real.logs import LogTracks
@@ -777,3 +778,21 @@ def test_a_run_says_which_entry_of_a_model_is_not_finite(ipe_bench):
     assert len(told) == 1
     assert told[0].startswith("ekf: ")
     assert "readings.z is nan at the mean of the prior" in " ".join(out.split())
+
+
+def test_a_program_without_a_terminal_has_an_answer(monkeypatch):
+    """As of pythonw, whose streams are None."""
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    assert main(["--version"]) == 0
+    assert main(["list", "solver"]) == 0
+    assert main(["list", "nothing"]) == 2
+
+
+@pytest.mark.parametrize("command", ["run", "report"])
+def test_a_full_disk_is_told_alike_of_commands_that_resume_and_begin_anew(command):
+    assert _explain(OSError(errno.ENOSPC, "No space left", "a.csv"), [command]) == (
+        1,
+        "a.csv: No space left; earlier results are intact; free some space and run the same"
+        " command again",
+    )

@@ -331,3 +331,12 @@ def test_a_profile_goes_on_where_the_slopes_of_an_exponential_overflow():
     step = np.sum((z - meets_it) ** 2) / 0.007**2
     assert step < found.chi_square[0] + norm.ppf(0.975) ** 2
     assert high[0] == np.inf
+
+
+def test_without_draws_there_are_no_bootstrap_intervals():
+    model = Polynomial(strength=0.0)
+    z = Scenario(model, Gaussian(0.01)).draw(0, 1).z[0]
+    problem = Problem(model, Gaussian(0.01).covariance(model.m))
+    found = examine(problem, z, fit(problem, z, LM, Gaussian(0.01)), bootstraps=0)
+    assert np.isnan(found.bootstrap.low).all()
+    assert np.isnan(found.bootstrap.high).all()
