@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from ipe_bench.basics.errors import UserError, did_you_mean, place_of, unknown
 from ipe_bench.basics.files import fault_of
@@ -45,7 +45,7 @@ _NAMED = re.compile(r"\s*(?P<reading>[A-Za-z_]\w*)\s*(?:=(?!=)|~)\s*(?P<formula>
 _DEFINED = re.compile(
     r"\s*(?P<name>[A-Za-z_]\w*)\s*\([^)]*\)\s*=(?!=)\s*(?P<formula>.+)", re.DOTALL
 )
-"""A formula such as f(t) = a*t, with arguments."""
+"""A formula with arguments: f(t), an equals sign, and a*t."""
 _START = re.compile(r"measurement\.start(?:\.(?P<name>\w+)=|=\{(?P<names>.*)\}$)")
 _MODELS = ("measurement", "state_model")
 _ALIKE = 4
@@ -272,7 +272,7 @@ class _Reader:
         return Short([*words, *self.others], self.files, [line for line in assumed if line])
 
     def _refuse_bare(self, names: Sequence[str]) -> None:
-        """Refuses a parameter as a key, as in b1=3."""
+        """Refuses a bare parameter as a key."""
         for word in self.others:
             name, equals, value = word.partition("=")
             if equals and name in names:
@@ -390,8 +390,8 @@ class _Reader:
             raise UserError(
                 f"{self.files[0]}: has no {'columns' if absent[1:] else 'column'}"
                 f" {enumerate_few(absent)}, which {what} takes (there are"
-                f" {', '.join(self.columns)}{near}); rename the column, or, of a parameter, give"
-                f" its start: {self._again(*starts)}"
+                f" {', '.join(self.columns)}{near}); rename the column, or give a parameter its"
+                f" start: as a default in {file}, or by {self._again(*starts)}"
             )
         reading = self._reading(what, wanted, ["reading"])
         words = ["measurement=function", f"measurement.of={module}:{chosen.name}"]
@@ -452,6 +452,8 @@ class _Reader:
             usual = (named["reading"],)
         what = f"the formula of {', '.join(names)}"
         self._refuse_bare(names)
+        if not columns and len(self._free([])) > 1:
+            self._refuse_without_column(names, usual)
         reading = self._reading(what, columns, usual)
         if not starts and not typed:
             raise UserError(
@@ -466,6 +468,28 @@ class _Reader:
         remedy = f"measurement.start.{parameters[0]}=X sets another"
         model = f"Model: {formula}{start}; {remedy}."
         return self._short(words, [model, self._told(columns, reading), self._noise()])
+
+    def _refuse_without_column(self, names: Sequence[str], usual: Sequence[str]) -> NoReturn:
+        """Refuses a formula of names that are no columns; one may be short for a column."""
+        free = self._free([])
+        likely = [column for column in free if column not in usual]
+        short = [(name, column) for name in names for column in likely if _is_short(name, column)]
+        there = f"no name in the formula is a column (there are {', '.join(self.columns)})"
+        if not short:
+            raise UserError(
+                f"{self.files[0]}: {there}; write the column that the readings depend on in the"
+                f" formula of {', '.join(names)}"
+            )
+        name, column = short[0]
+        model = re.sub(rf"\b{re.escape(name)}\b", column, self.model)
+        rest = [one for one in free if one != column]
+        reading = next((one for one in usual if one in rest), rest[0])
+        others = [one for one in rest if one != reading]
+        words = [] if reading in usual else [f"measurement.reading={reading}"]
+        words += [self._ignoring(others)] if others else []
+        raise UserError(
+            f"{self.files[0]}: {there}; if {name} is {column}: {self._again(*words, model=model)}"
+        )
 
     # Equations
 
@@ -532,6 +556,12 @@ def _undefined(content: dict[str, Any]) -> list[str]:
     formulas = [*content.get("next", {}).values(), *content.get("readings", {}).values()]
     names = [name for text in formulas for name in parse(str(text), "formula").names]
     return [name for name in dict.fromkeys(names) if name not in known]
+
+
+def _is_short(name: str, column: str) -> bool:
+    """Tells if one of a name and a column begins with the other, as time with t."""
+    short, long = sorted((name.lower(), column.lower()), key=len)
+    return long.startswith(short)
 
 
 def _reading_word(reading: str, usual: Sequence[str]) -> list[str]:

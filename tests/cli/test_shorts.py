@@ -135,10 +135,19 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
         (["falling.py", "falling.csv", "measurement=gins"], "and measurement=gins is another"),
         (["a*t+b)", "line.csv"], "is not a formula at ')'"),
         (["a*exq(t)", "line.csv"], "exq(...): there is no such function; did you mean exp?"),
-        (["a*tt+b", "line.csv"], "column t is not in the formula of a, tt, b"),
+        (
+            ["a*tt+b", "line.csv"],
+            "no name in the formula is a column (there are t, y); if tt is t: ipe-bench"
+            " estimate 'a*t+b' line.csv",
+        ),
         (
             ["a*tt+b", "volt.csv"],
-            "no name in the formula of a, tt, b is a column (there are t, volt)",
+            "no name in the formula is a column (there are t, volt); if tt is t: ipe-bench"
+            " estimate 'a*t+b' volt.csv measurement.reading=volt",
+        ),
+        (
+            ["volt = a*x+b", "warm.csv"],
+            "write the column that the readings depend on in the formula of a, x, b",
         ),
         (
             ["a*t+b", "warm.csv"],
@@ -152,7 +161,8 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
         (
             ["free.py", "line.csv"],
             "line.csv: has no columns h, v, which fall(t, h, v) takes (there are t, y); rename the"
-            " column, or, of a parameter, give its start: ipe-bench estimate free.py line.csv"
+            " column, or give a parameter its start: as a default in free.py, or by ipe-bench"
+            " estimate free.py line.csv"
             " measurement.start.h=1 measurement.start.v=1",
         ),
         (

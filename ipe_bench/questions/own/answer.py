@@ -128,7 +128,8 @@ def advice(own: Own, point: Point) -> str:
     others = [one for one in ranked(own, point) if one is not best]
     lost = _missing(own, others)
     if not lost and others:
-        lost = f"no other {_verb(own)}"
+        what = "lose the track" if own.moving else "miss the best fit"
+        lost = f"no other is seen to {what} in more than {100 * (1 - _MISSES):.0f} %"
     return "; ".join(filter(None, [f"take {best.label}", _bars_in_words(best), lost]))
 
 
