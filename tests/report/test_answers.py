@@ -28,6 +28,7 @@ from ipe_bench.questions.compare.figure import _measure, _names, _outcome, _sign
 from ipe_bench.questions.design.answer import _draw_design, _findings, _ways
 from ipe_bench.questions.posterior.figure import draw_marginals
 from ipe_bench.questions.posterior.maths import Posterior, Reference
+from ipe_bench.real.logs import Constant
 from ipe_bench.report.figures.answers import _drawn, _left_out, draw_fit
 from ipe_bench.report.figures.common import full_ticks, text
 from ipe_bench.report.figures.log import draw_log
@@ -365,6 +366,18 @@ def test_a_page_says_what_was_tested_only_where_something_was(walked):
         ][: 2 * tested]
         assert smoothers == "Smoothers: rts: later readings count in their paths."
         assert (_finding(answer) == "tracks") != tested
+
+
+def test_the_interval_of_a_constant_shows_as_many_figures_as_its_width_has(walked):
+    found, _ = walked
+    large = Constant("large", 523.71, 0.01, 523.69, 523.73)
+    held = Constant("held", 0.0, np.nan, 0.0, 0.3)
+    one = replace(found["kf"], constants=(large, held))
+    (table,) = LogAnswer(found.log, [one])._constants()
+    assert [cell.text for cell in table.columns[-1].cells] == [
+        "523.6900 … 523.7300",
+        "0.000 … 0.300",
+    ]
 
 
 def test_the_title_of_a_log_says_whether_the_model_fits_it(walked):

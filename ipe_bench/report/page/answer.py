@@ -263,7 +263,7 @@ class Answer(Labelled[Fit]):
         ):
             value = f"{_number(x, 6)} (on its bound)"
             if p.name in ends:
-                value = f"{_beside(x, error)} ({_interval(*ends[p.name], x)})"
+                value = f"{_beside(x, error)} ({between(*ends[p.name], x)})"
             found.append(f"{p.name} = {value} {p.unit}".rstrip())
         return found
 
@@ -602,14 +602,14 @@ def _intervals(found: Examination) -> Table:
     on_bounds = found.on_bounds
     absent = ["-"] * len(on_bounds)
     parameters = [*found.model.physical_parameters, *(one.parameter for one in on_bounds)]
-    profiles = [*map(_interval, *found.profiles, found.x)]
+    profiles = [*map(between, *found.profiles, found.x)]
     for one in on_bounds:
         low, high = sorted((one.bound, one.other))
-        profiles.append(_interval(low, high, math.nan))
-    bootstrap = map(_interval, found.bootstrap.low, found.bootstrap.high, found.x)
+        profiles.append(between(low, high, math.nan))
+    bootstrap = map(between, found.bootstrap.low, found.bootstrap.high, found.x)
     columns = [
         *naming("parameter", parameters),
-        texts("standard error", [*map(_interval, *found.wald, found.x), *absent]),
+        texts("standard error", [*map(between, *found.wald, found.x), *absent]),
         texts("profile", profiles),
         texts("bootstrap", [*bootstrap, *absent]),
     ]
@@ -617,7 +617,7 @@ def _intervals(found: Examination) -> Table:
     return Table("intervals", title, "", columns)
 
 
-def _interval(low: float, high: float, middle: float) -> str:
+def between(low: float, high: float, middle: float) -> str:
     """Rounds the ends to a hundredth of twice the lesser distance to the estimate `middle`, or of
     the width if outside."""
     if not math.isfinite(high - low) or high <= low:
@@ -689,7 +689,7 @@ def _other_minima(found: Examination, names: Sequence[str]) -> Iterator[str]:
 def _on_profiles(found: Examination, names: Sequence[str]) -> Iterator[str]:
     """Says for which parameters the profile differs from the Wald interval, or lacks an end."""
     if found.bent.any():
-        intervals = map(_interval, *found.profiles, found.x)
+        intervals = map(between, *found.profiles, found.x)
         each = [f"{name} {text}" for name, text in zip(names, intervals, strict=True)]
         ends = enumerate_few(list(compress(each, found.bent)), 3)
         level = f"{100 * CONFIDENCE:.0f} %"

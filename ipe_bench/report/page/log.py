@@ -11,7 +11,7 @@ import numpy as np
 
 from ipe_bench.measurements.base import with_unit
 from ipe_bench.real.logs import SEARCHES, Log, LogQuestion, LogTracks, far_below
-from ipe_bench.report.page.answer import Labelled, as_json, read_from, with_error
+from ipe_bench.report.page.answer import Labelled, as_json, between, read_from, with_error
 from ipe_bench.report.page.writer import write_files, write_result
 from ipe_bench.report.tables.table import (
     Fact,
@@ -174,13 +174,11 @@ class LogAnswer(Labelled[LogTracks]):
         found = [constant for one in self.tracks for constant in one.constants]
         if not found:
             return []
-        low = [each.low for each in found]
-        high = [each.high for each in found]
         columns = [
             words("tracker", labels),
             words("constant", [each.name for each in found]),
             texts("value ± standard error", [with_error(each.value, each.error) for each in found]),
-            interval("95 %", low, high, short),
+            texts("95 %", [between(each.low, each.high, each.value) for each in found]),
         ]
         return [Table("constants", "Constants of largest likelihood", "", columns)]
 
