@@ -18,6 +18,11 @@ Given all readings and the state before, w = R'^-1 (r - S' x[k-1] + e) with e ~ 
 
 The pivots of R are 1 at least: G may be of any rank, and a prior however wide costs no digits. A
 trial has the same bits in any batch.
+
+Arrays of states hold 1 + K epochs, and those of what leads to a state or is read of it the K from
+the second on: `A[:, k - 1]` leads to `x[:, k]`. `Step.run` lets the shorter ones lack their first
+epoch, so that one number k counts in all of them. *Links* are the rows M, b, N of each epoch, and
+the pivots of R.
 """
 
 from __future__ import annotations
@@ -98,47 +103,51 @@ class Noise:
 
     def _states(self, of: Tangents, *given: Array) -> Array:
         """Computes the states for A, B, a, v and, if they are damped, roots of D."""
-        steps = self._steps(of, damped=len(given) > 4)
+        chain = self._chain_of(of, damped=len(given) > 4)
         given = tuple(map(own, given))
         x = np.empty(given[2].shape)
-        for rows, told in self._pieces(steps, len(x)):
-            begun = self._back(steps, [part[rows] for part in given], told)
+        for rows, links in self._pieces(chain, len(x)):
+            begun = self._passed_back(chain, [part[rows] for part in given], links)
             states = x[rows]
-            states[:, 0] = steps.first.part(begun, "x")
-            steps.ahead.run(states[:, 0].copy(), [told], _NONE, states, 1, 1, len(self.gains))
+            states[:, 0] = chain.first.part(begun, "x")
+            chain.ahead.run(
+                states[:, 0].copy(), [links], _NONE, states, first=1, by=1, count=len(self.gains)
+            )
         return x
 
     def spread(self, of: Tangents) -> Given:
         """Computes what all readings say of the states."""
         trials, K, n, _ = of.A.shape
-        steps = self._steps(of, damped=False)
+        chain = self._chain_of(of, damped=False)
         nothing = np.zeros((trials, 1 + K, n)), np.zeros(of.B.shape[:3])
         given = [own(part) for part in (of.A, of.B, *nothing)]
         P = np.empty((trials, 1 + K, n * n))
         with_last = np.empty(P.shape)
         size = np.empty(trials)
-        for rows, told in self._pieces(steps, trials):
-            begun = self._back(steps, [part[rows] for part in given], told)
-            P[rows, 0] = steps.first.part(begun, "covariance")
-            F = steps.first.part(begun, "F").copy()
-            steps.spread.run(F, [told], _NONE, P[rows], 1, 1, K)
-            last = np.tile(np.eye(n).ravel(), (len(told), 1))
-            steps.across.run(last, [P[rows], told], _NONE, with_last[rows], K, -1, 1 + K)
-            size[rows] = np.log(steps.first.part(begun, "pivots")).sum(axis=1)
-            size[rows] += np.log(steps.later.part(told[:, 1:], "pivots")).sum(axis=(1, 2))
+        for rows, links in self._pieces(chain, trials):
+            begun = self._passed_back(chain, [part[rows] for part in given], links)
+            P[rows, 0] = chain.first.part(begun, "covariance")
+            F = chain.first.part(begun, "F").copy()
+            chain.covariances.run(F, [links], _NONE, P[rows], first=1, by=1, count=K)
+            last = np.tile(np.eye(n).ravel(), (len(links), 1))
+            chain.crossed.run(
+                last, [P[rows], links], _NONE, with_last[rows], first=K, by=-1, count=1 + K
+            )
+            size[rows] = np.log(chain.first.part(begun, "pivots")).sum(axis=1)
+            size[rows] += np.log(chain.later.part(links[:, 1:], "pivots")).sum(axis=(1, 2))
         shape = trials, 1 + K, n, n
         return Given(P.reshape(shape), with_last.reshape(shape), 2 * size)
 
-    def _back(self, steps: _Steps, given: Sequence[Array], told: Array) -> Array:
+    def _passed_back(self, chain: _Chain, given: Sequence[Array], links: Array) -> Array:
         """Fills how states follow from those before (trials, 1 + K, t), from the second on, and
         returns what is said of the first (trials, s)."""
-        trials, epochs, _ = told.shape
+        trials, epochs, _ = links.shape
         start, gains = self._shared
-        carry = np.zeros((trials, steps.carried.size))
-        steps.back.run(carry, given, gains, told, epochs - 1, -1, epochs - 1)
-        begun = np.empty((trials, 1, steps.first.size))
+        carry = np.zeros((trials, chain.carried.size))
+        chain.back.run(carry, given, gains, links, first=epochs - 1, by=-1, count=epochs - 1)
+        begun = np.empty((trials, 1, chain.first.size))
         _, _, a, _, *D = given
-        steps.begin.run(carry, [a, *D], start, begun, 0, 1, 1)
+        chain.begin.run(carry, [a, *D], start, begun, first=0, by=1, count=1)
         return begun[:, 0]
 
     def blind_variances(self, of: Tangents) -> Array:
@@ -159,23 +168,23 @@ class Noise:
         x = np.zeros(variances.shape) if x is None else x
         carry = np.tile(np.append(packed(self.start), 0.0), (trials, 1))
         given = [own(part) for part in (of.A, of.B, x)]
-        filtered = self._steps(of, damped=False).filter
-        filtered.run(carry, given, self._shared[1], variances, 1, 1, K)
+        filtered = self._chain_of(of, damped=False).filter
+        filtered.run(carry, given, self._shared[1], variances, first=1, by=1, count=K)
         return variances, carry[:, -1]
 
-    def _pieces(self, steps: _Steps, trials: int) -> Iterator[tuple[slice, Array]]:
+    def _pieces(self, chain: _Chain, trials: int) -> Iterator[tuple[slice, Array]]:
         """Yields trials that are held at once, with room for how their states follow (trials, 1 +
         K, t)."""
-        size = steps.later.size
+        size = chain.later.size
         epochs = 1 + len(self.gains)
         at_once = max(_LANES, int(_NUMBERS / (epochs * size)) // _LANES * _LANES)
-        told = np.empty((min(trials, at_once), epochs, size))
+        links = np.empty((min(trials, at_once), epochs, size))
         for i in range(0, trials, at_once):
             rows = slice(i, min(i + at_once, trials))
-            yield rows, told[: rows.stop - i]
+            yield rows, links[: rows.stop - i]
 
-    def _steps(self, of: Tangents, damped: bool) -> _Steps:
-        return _steps(of.B.shape[2], *self._shapes, damped)
+    def _chain_of(self, of: Tangents, damped: bool) -> _Chain:
+        return _made_chain(of.B.shape[2], *self._shapes, damped)
 
     @functools.cached_property
     def _patterns(self) -> tuple[Array, Array]:
@@ -203,7 +212,7 @@ def _places(some: Array) -> Shape:
     return tuple(map(tuple, some.tolist()))
 
 
-class _Steps(NamedTuple):
+class _Chain(NamedTuple):
     """Holds the steps along affine models, and layouts of what they take and give."""
 
     carried: Layout
@@ -212,15 +221,20 @@ class _Steps(NamedTuple):
     """How states follow from those before."""
     first: Layout
     back: Step
+    """Passes what readings say from an epoch to the one before."""
     begin: Step
+    """Computes the first states."""
     ahead: Step
-    spread: Step
-    across: Step
+    """Computes states from those before."""
+    covariances: Step
+    """By all readings, from the first epoch on."""
+    crossed: Step
+    """Covariances with the last states, from the last epoch back."""
     filter: Step
 
 
 @functools.lru_cache(maxsize=64)
-def _steps(m: int, start: Shape, gains: Shape, damped: bool) -> _Steps:
+def _made_chain(m: int, start: Shape, gains: Shape, damped: bool) -> _Chain:
     assert not isinstance(start, int)
     assert not isinstance(gains, int)
     n = len(gains)
@@ -249,22 +263,22 @@ def _steps(m: int, start: Shape, gains: Shape, damped: bool) -> _Steps:
         return named_step(text, text.__name__, carried, each, shared, shown)
 
     of_root = Layout(**follows, N=N)
-    return _Steps(
+    return _Chain(
         carried,
         later,
         first,
-        made(_back, carried, given, shared, later),
-        made(_begin, carried, begun, Layout(G=start), first),
-        made(_ahead, Layout(x=n), [Layout(**follows)], nothing, Layout(x=n)),
-        made(_spread, root, [of_root], nothing, covariance),
+        made(_step_back, carried, given, shared, later),
+        made(_step_begin, carried, begun, Layout(G=start), first),
+        made(_step_ahead, Layout(x=n), [Layout(**follows)], nothing, Layout(x=n)),
+        made(_step_covariances, root, [of_root], nothing, covariance),
         made(
-            _across,
+            _step_crossed,
             Layout(last=square),
             [covariance, Layout(M=square)],
             nothing,
             Layout(crossed=square),
         ),
-        made(_filter, filtered, [*given[:2], Layout(x=n)], shared, Layout(variances=n)),
+        made(_step_filter, filtered, [*given[:2], Layout(x=n)], shared, Layout(variances=n)),
     )
 
 
@@ -272,7 +286,7 @@ def _turned(A: Rows) -> Rows:
     return [list(column) for column in zip(*A, strict=True)]
 
 
-class _Told(NamedTuple):
+class _Eliminated(NamedTuple):
     """Holds how noise and states follow from the states before."""
 
     N: Rows
@@ -283,15 +297,17 @@ class _Told(NamedTuple):
     y: Vector
 
 
-def _told(A: Rows, a: Vector, G: Rows, C: Rows, c: Vector) -> _Told:
+def _eliminated(A: Rows, a: Vector, G: Rows, C: Rows, c: Vector) -> _Eliminated:
     """Passes |C' x - c|^2 on from states x = A x[k-1] + a + G w to those before."""
     n = len(A[0])
     q = len(G[0])
+    # W is the left side of the first equation above, whose last row is c - a' C, and L the right.
     left = [of - dot(a, column) for of, column in zip(c, _turned(C), strict=True)]
     W = beside(product(_turned(G), C), unit(q))
     W += beside([*product(_turned(A), C), left], zeros(n + 1, q))
     L = lower(W)
     R, S, r = ([row[:q] for row in rows] for rows in (L[:q], L[q:-1], L[-1:]))
+    # N R' = G, column after column.
     N = []
     for gains in G:
         row: Vector = []
@@ -299,14 +315,14 @@ def _told(A: Rows, a: Vector, G: Rows, C: Rows, c: Vector) -> _Told:
             row.append((gain - dot(above, row)) * (1.0 / above[len(row)]))
         N.append(row)
     Y = [row[q : q + n] for row in L[q:-1]]
-    return _Told(N, S, r[0], [row[i] for i, row in enumerate(R)], Y, L[-1][q : q + n])
+    return _Eliminated(N, S, r[0], [row[i] for i, row in enumerate(R)], Y, L[-1][q : q + n])
 
 
 def _diagonal(D: Vector) -> Rows:
     return [[d if i == j else 0.0 for j in range(len(D))] for i, d in enumerate(D)]
 
 
-def _back(
+def _step_back(
     Y: Rows, y: Vector, A: Rows, B: Rows, a: Vector, v: Vector, G: Rows, D: Vector | None = None
 ) -> dict[str, Any]:
     """Steps back from an epoch to the one before."""
@@ -315,7 +331,7 @@ def _back(
     if D:
         C = beside(C, _diagonal(D))
         c += [0.0] * len(D)
-    N, S, r, pivots, Y, y = _told(A, a, G, C, c)
+    N, S, r, pivots, Y, y = _eliminated(A, a, G, C, c)
     # Without noise a product with its slopes has no columns.
     moved = product(N, _turned(S)) if pivots else zeros(len(A), len(A))
     M = [
@@ -325,7 +341,7 @@ def _back(
     return {"Y": Y, "y": y, "M": M, "b": plus(a, N, r), "N": N, "pivots": pivots}
 
 
-def _begin(Y: Rows, y: Vector, a: Vector, G: Rows, D: Vector | None = None) -> dict[str, Any]:
+def _step_begin(Y: Rows, y: Vector, a: Vector, G: Rows, D: Vector | None = None) -> dict[str, Any]:
     """Computes the first states, which have none before."""
     C = Y
     c = y
@@ -333,28 +349,28 @@ def _begin(Y: Rows, y: Vector, a: Vector, G: Rows, D: Vector | None = None) -> d
         C = beside(C, _diagonal(D))
         c = [*c, *[0.0] * len(D)]
     none: Rows = [[] for _ in Y]
-    N, _, r, pivots, _, _ = _told(none, a, G, C, c)
+    N, _, r, pivots, _, _ = _eliminated(none, a, G, C, c)
     F = lower(N)
     x = plus(a, N, r)
     return {"Y": Y, "y": y, "x": x, "F": F, "covariance": gram(F), "pivots": pivots}
 
 
-def _ahead(x: Vector, M: Rows, b: Vector) -> dict[str, Any]:
+def _step_ahead(x: Vector, M: Rows, b: Vector) -> dict[str, Any]:
     return {"x": plus(b, M, x)}
 
 
-def _spread(F: Rows, M: Rows, b: Vector, N: Rows) -> dict[str, Any]:
+def _step_covariances(F: Rows, M: Rows, b: Vector, N: Rows) -> dict[str, Any]:
     """Computes covariances by all readings."""
     F = lower(beside(product(M, F), N))
     return {"F": F, "covariance": gram(F)}
 
 
-def _across(last: Rows, covariance: Rows, M: Rows) -> dict[str, Any]:
+def _step_crossed(last: Rows, covariance: Rows, M: Rows) -> dict[str, Any]:
     """Computes covariances with the last states."""
     return {"crossed": product(covariance, last), "last": product(_turned(M), last)}
 
 
-def _filter(F: Rows, doubt: Vector, A: Rows, B: Rows, x: Vector, G: Rows) -> dict[str, Any]:
+def _step_filter(F: Rows, doubt: Vector, A: Rows, B: Rows, x: Vector, G: Rows) -> dict[str, Any]:
     """Takes in readings, and asks what floats keep of them."""
     m = len(B)
     F = lower(beside(product(A, F), G))
