@@ -179,6 +179,8 @@ class Noise:
         epochs = 1 + len(self.gains)
         at_once = max(_LANES, int(_NUMBERS / (epochs * size)) // _LANES * _LANES)
         links = np.empty((min(trials, at_once), epochs, size))
+        # Nothing leads to the first states, yet the pass of `crossed` reads a row there, too.
+        links[:, 0] = 0.0
         for i in range(0, trials, at_once):
             rows = slice(i, min(i + at_once, trials))
             yield rows, links[: rows.stop - i]

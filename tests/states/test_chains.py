@@ -166,3 +166,12 @@ def test_a_trial_has_the_same_bits_alone_and_beside_one_that_is_not_finite():
         alone = results((A[some], B[some], D[some], G, a[some], v[some]))
         for one, whole in zip(alone, together, strict=True):
             np.testing.assert_array_equal(one, whole[some])
+
+
+@pytest.mark.usefixtures("engine")
+def test_covariances_do_not_read_memory_that_nothing_was_written_to(monkeypatch):
+    """Whose numbers may overflow: nothing leads to the first states."""
+    monkeypatch.setattr(np, "empty", lambda shape: np.full(shape, np.inf))
+    A, B, _, G, _, _ = chains(11)
+    found = noise(G).spread(Tangents(A, B))
+    assert all(np.isfinite(one).all() for one in found)
