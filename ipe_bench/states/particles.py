@@ -110,8 +110,13 @@ def _innovation(
     p = (p / p.sum(axis=1, keepdims=True))[..., None]
     if model.R_by_state:
         R = np.sum(p[..., None] * R, axis=1)
-    y = np.sum(p * r, axis=1)
-    d = r - y[:, None]
+    if model.periods:
+        # The mean of what comes round must not lie next to the reading by itself.
+        likeliest = p.argmax(axis=1, keepdims=True)
+        r = model.nearest(r, np.take_along_axis(r, likeliest, axis=1))
+    mean = np.sum(p * r, axis=1)
+    y = model.nearest(mean, np.zeros(mean.shape))
+    d = r - mean[:, None]
     # A missing reading has unit variance.
     S = np.matmul(transposed(d * p), d) + np.where(both, R, np.eye(R.shape[-1]))
     return y, factor(S)

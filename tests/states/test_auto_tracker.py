@@ -149,6 +149,18 @@ def test_a_reading_that_comes_round_among_scalar_states_has_the_exact_density(sp
         assert found.covariance[trial, -1, 0, 0] == pytest.approx(variance, rel=1e-3)
 
 
+def test_what_is_predicted_of_a_reading_that_comes_round_does_not_depend_on_it():
+    """A phase that is even on a turn beforehand has squared innovations that are one on average."""
+    even = {"readings": {"z": "3*x"}, "period": {"z": 2 * np.pi}, "spread": {"x": 2.0}}
+    phase = replace(SQUARE, **even, deviation={"z": 0.1}, count=1)
+    z = np.linspace(-np.pi, np.pi, 41)[1:, None, None]
+    found = Grid().track(phase, z)
+    assert found.predicted is not None
+    turned = np.remainder(found.predicted - found.predicted[0] + 1, 2 * np.pi)
+    np.testing.assert_allclose(turned, 1.0)
+    assert found.nis.mean() == pytest.approx(1.0, abs=0.02)
+
+
 def test_a_scalar_state_whose_readings_come_round_far_away_needs_no_grid():
     phase = replace(SQUARE, readings={"z": "x"}, period={"z": 40.0}, spread={"x": 0.5})
     assert (AutoTracker().track(phase, phase.draw(0, 20).z).stage != EXACT).all()
