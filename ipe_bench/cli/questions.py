@@ -84,7 +84,10 @@ def _asked(name: str, arguments: Sequence[str], row: Row, files: Sequence[str]) 
     from ipe_bench.cli.own_data import like_these
     from ipe_bench.cli.single import single
 
-    found = single(name, arguments, moving=row.moving, run=row.without or (), estimate=OF_FILES)
+    # The paper's iteration may end nowhere on a model that it was not made for.
+    standard = ["solver=[auto]"] if files else []
+    refused = {"run": row.without or (), "estimate": OF_FILES}
+    found = single(name, arguments, standard, row.moving, **refused)
     trials = found.spec.count if "trials" in found.words.keys else None
     spec = found.spec
     if files:

@@ -251,6 +251,18 @@ def test_the_bounds_of_a_design_are_the_standard_errors_of_the_estimate(ipe_benc
 
 
 @pytest.mark.slow
+def test_the_posterior_of_ones_own_model_is_compared_with_auto(ipe_bench) -> None:
+    """The paper's iteration may end nowhere; a solver that is chosen stands in its place."""
+    words = ("posterior", "a*t + b", "line.csv", "trials=1", "particles=100", "baseline=[]")
+    _, out, _ = ipe_bench(*words)
+    assert "  auto  " in out
+    assert "fixed_point" not in out
+    _, out, _ = ipe_bench(*words, "solver=[newton]")
+    assert "  newton  " in out
+    assert "  auto  " not in out
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["run", "design", "posterior"])
 def test_exact_readings_have_no_noise_to_simulate(ipe_bench, folder: Path, command: str) -> None:
     rows = [f"{t},{2 * t + 1}" for t in range(8)]
