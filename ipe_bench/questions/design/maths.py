@@ -214,7 +214,9 @@ def design(
     value = judge.value(gram(own))
     if np.isfinite(value):
         judge = replace(judge, today=value)
-    units = [_units(model, candidates, chosen, slopes) for chosen in columns]
+    # Readings may be so alike that products of their slopes do not tell them apart.
+    apart = np.isfinite(judge.value(judge.everything))
+    units = [_units(model, candidates, chosen, slopes) for chosen in columns if apart]
     tried = [_way(judge, one, model.m, most) for one in units]
     ways = tuple(way for way in tried if way is not None)
     if readings is not None and not ways:

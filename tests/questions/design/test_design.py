@@ -600,3 +600,18 @@ def test_more_readings_than_a_file_has_are_refused_with_what_to_do():
         ib.design(own, readings=12)
     assert "options" not in str(refused.value)
     assert "What to read next" in str(ib.design(own))
+
+
+def test_readings_that_are_nearly_alike_offer_no_choice():
+    """Three parameters from two times that differ by 1e-5: the bound is known, and is large."""
+    start = {"a": 1.0, "b": 0.3, "c": 0.1}
+    t = np.array([1.0, 1.00001, 3.0])
+    model = ib.measurements.Formula("a*exp(-b*t)+c", start, {"t": t.tolist()})
+    found = ib.design(Scenario(model, Gaussian(0.1), error_scale=0.1))
+    e = np.exp(-0.3 * t)
+    J = np.stack([e, -t * e, np.ones(3)], axis=1) / 0.1
+    bound = np.linalg.norm(np.linalg.inv(J), axis=1) / [1.0, 0.3, 0.1]
+    np.testing.assert_allclose(found.observability.bound, bound, rtol=1e-4)
+    assert found.ways == ()
+    with pytest.raises(ib.UserError, match="do not determine all parameters"):
+        ib.design(Scenario(model, Gaussian(0.1), error_scale=0.1), readings=3)
