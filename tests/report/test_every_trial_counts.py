@@ -10,14 +10,25 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
 from report.test_paper import read
 from shared.random_results import results
+from shared.synthetic_store import Synthetic
 
+import ipe_bench as ib
+from ipe_bench.measurements import Formula, Polynomial
+from ipe_bench.questions.audit.figure import draw_audit
+from ipe_bench.questions.compare.figure import draw_pairs
+from ipe_bench.questions.design.answer import _draw_design
+from ipe_bench.questions.posterior.answer import sampled
+from ipe_bench.questions.posterior.figure import draw_marginals
 from ipe_bench.report.figures import drawings
 from ipe_bench.report.figures.headline import MOST_CURVES, chosen
 from ipe_bench.report.figures.views import views
@@ -358,6 +369,86 @@ def cut_where_it_falls(shown: Any, analysis: Analysis) -> Iterator[str]:
                 values = values[np.isfinite(values)]
                 if len(values) and (values.min() < low or values.max() > high):
                     yield f"{name}: a curve leaves the panel"
+
+
+# Questions ----------------------------------------------------------------------------------------
+
+STEMS = ("", "velocity_of_the_platform_in_the_direction_of_")
+
+
+def audited(rng: np.random.Generator, folder: Path) -> Iterable[Any]:
+    """Draws an audit of many parameters of long names, with heavy tails and infinite errors."""
+    stem = STEMS[rng.integers(2)]
+    columns: dict[str, Any] = {}
+    for i in range(rng.integers(1, 14)):
+        errors = rng.standard_t(rng.choice([1.5, 3, 30]), 60) * 10 ** rng.uniform(-1.5, 2.5)
+        errors[rng.random(60) < rng.choice([0, 0.1, 1.0])] = np.inf
+        columns |= {f"{stem}p{i}_error": errors, f"{stem}p{i}_std": 1.0}
+    return draw_audit(ib.audit(pd.DataFrame(columns)))
+
+
+def compared(rng: np.random.Generator, folder: Path) -> Iterable[Any]:
+    """Draws comparisons of estimators of long names at scales that are nearly the same."""
+    labels = ["ekf", "ekf_2", *(f"{STEMS[1]}{who}" for who in ("mine", "yours"))]
+    for name in "ab":
+        store = Synthetic(folder / name)
+        for scale in [1.0, 1.00001, 10.0][: rng.integers(1, 4)]:
+            for label in labels[: rng.integers(1, 5)]:
+                errors = 10 ** rng.uniform(-3, 0) * rng.standard_normal((60, 3))
+                scenario = store.scenario(error_scale=scale)
+                store.add(scenario, label, errors, simulations=float(rng.integers(1, 50)))
+    return draw_pairs(ib.compare(folder / "a", folder / "b"))
+
+
+def designed(rng: np.random.Generator, folder: Path) -> Iterable[Any]:
+    """Draws a design by readings of which some are nearly alike."""
+    t = [0.0, *rng.choice([1.0, 1.00001, 2.0, 3.0, 4.0, 1e6], rng.integers(2, 8))]
+    start = {"a": 1.0, "b": 0.3, "c": 0.1}
+    model = Formula("a*exp(-b*t)+c", start, {"t": np.unique(t).tolist()})
+    return _draw_design(ib.design(model, noise=ib.noise.Gaussian(0.1), error_scale=0.1))
+
+
+def posteriors(rng: np.random.Generator, folder: Path) -> Iterable[Any]:
+    """Draws a posterior and many estimators."""
+    bench = ib.Scenario(Polynomial(), ib.noise.Gaussian(0.01))
+    estimators = {f"lse{'_' * i}": ib.baselines.LinearLSE() for i in range(rng.integers(1, 7))}
+    return draw_marginals(bench.measurement, sampled(bench, estimators, 1, 80))
+
+
+def faults_of_question(kind: Any, seed: int, folder: Path) -> Iterator[str]:
+    """Yields what cannot be told apart in the figures of a question, and what leaves its panel."""
+    try:
+        with house_style():
+            drawn = list(kind(np.random.default_rng([seed, 3]), folder))
+    except ib.UserError:
+        return
+    for drawing in drawn:
+        found = set(alike_in(drawing))
+        if kind is compared:
+            # Its intervals are rows, whose colours and words are verdicts.
+            found = {one for one in found if "curves" not in one}
+        yield from found
+        for ax in drawing.figure.axes:
+            low, high = sorted(ax.get_ylim())
+            for line in ax.lines:
+                values = np.asarray(line.get_ydata(), dtype=float)
+                if line.get_transform() != ax.transData or not np.isfinite(values).any():
+                    continue
+                if np.nanmin(values) < low or np.nanmax(values) > high:
+                    yield f"{drawing.name}: a curve leaves the panel"
+        plt.close(drawing.figure)
+
+
+@pytest.mark.parametrize("kind", [audited, compared, designed])
+def test_figures_of_questions_tell_all_apart(kind, tmp_path):
+    assert list(faults_of_question(kind, 1, tmp_path)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("kind", [audited, compared, designed, posteriors])
+def test_figures_of_many_questions_tell_all_apart(kind, seed, tmp_path):
+    assert list(faults_of_question(kind, seed, tmp_path)) == []
 
 
 @pytest.mark.parametrize("seed", range(4))

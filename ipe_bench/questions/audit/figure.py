@@ -36,7 +36,8 @@ def draw_audit(found: Audit) -> Iterator[Drawing]:
     for i, ax in zip(chosen, axes, strict=True):
         expected, errors = quantiles(claims.z[:, i])
         _draw_quantiles(ax, expected, errors, found.each[i].value)
-        common.title(ax, f"{claims.names[i]}: {_times(found.each[i].value)}")
+    named = [f"{claims.names[i]}: {_times(found.each[i].value)}" for i in chosen]
+    common.titles(axes, named)
     common.axis_labels(fig, "quantile if reported right", "error / reported deviation")
     common.legend(fig, axes)
     caption = "Steeper than the dashed line: larger than reported. Bent at its ends: heavy tails."
@@ -48,7 +49,7 @@ def draw_audit(found: Audit) -> Iterator[Drawing]:
 def _times(factor: float) -> str:
     if np.isfinite(factor):
         return f"{factor:.2f} times as reported"
-    return "infinite errors" if factor > 1 else "too few runs with finite errors"
+    return "infinite errors" if factor > 1 else "few finite errors"
 
 
 def quantiles(z: Array) -> tuple[Array, Array]:

@@ -67,6 +67,7 @@ def draw_pairs(frame: pd.DataFrame) -> Iterator[Drawing]:
     look = dict.fromkeys(labels[:MOST_ROWS], Look(BOUND_COLOR, "o"))
     fig, axes = common.panels(len(kinds), look, scales=[0.0], row=1)
     fig.set_figheight((0.4 * len(look) + 0.75) * len(kinds) + 0.3)
+    told = []
     for kind, ax in zip(kinds, axes, strict=True):
         measure = _measure(kind, frame.attrs["margins"][kind.partition(" ")[0]])
         named = [(row, name) for row, name in zip(rows, names, strict=True) if name in look]
@@ -76,7 +77,8 @@ def draw_pairs(frame: pd.DataFrame) -> Iterator[Drawing]:
         _set_axis(ax, measure)
         for row, y in shown:
             _mark_cut(ax, row, y, measure)
-        common.title(ax, f"{kind}, {measure.words}")
+        told.append(f"{kind}, {measure.words}")
+    common.titles(axes, told)
     common.legend(fig, axes)
     caption = (
         "Second against first in the same trials, each with its own interval. Filled: beyond the"

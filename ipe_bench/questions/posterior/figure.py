@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,6 +28,10 @@ FARTHEST = 4.5
 """Standard deviations about the middle that a distribution is drawn to."""
 
 
+MARKED_EVERY = 50
+"""Points of a curve from one of its markers to the next."""
+
+
 class _Gaussian(NamedTuple):
     x: Array
     """(n,)"""
@@ -51,14 +54,16 @@ def draw_marginals(model: Measurement, found: Sequence[Reference]) -> Iterator[D
         style = {"color": BOUND_COLOR, "alpha": 0.25, "label": "posterior"}
         ax.hist(draws, bins=40, range=(low, high), density=True, **style)
         at = np.linspace(low, high, 300)
-        for label, claim in claims.items():
-            _draw_density(ax, at, p.size * claim.x[i], p.size * claim.deviation[i], look[label])
+        for first, (label, claim) in enumerate(claims.items()):
+            gaussian = p.size * claim.x[i], p.size * claim.deviation[i]
+            _draw_density(ax, at, *gaussian, look[label], MARKED_EVERY * first // len(claims))
         ax.axvline(p.size * one.truth[i], color=BOUND_COLOR, linestyle=":", label="truth")
         ax.set_xlim(low, high)
         ax.set_yticks([])
-        common.title(ax, with_unit(p.name, p.unit))
         common.full_ticks(ax)
-    common.legend(fig, axes, {label: replace(each, marker="") for label, each in look.items()})
+    named = [model.parameters[i] for i in chosen]
+    common.titles(axes, [with_unit(p.name, p.unit) for p in named])
+    common.legend(fig, axes, look)
     caption = f"Trial {one.trial}: draws of the posterior, and the Gaussians that estimators report"
     if len(chosen) < model.n:
         caption += f", the {len(chosen)} parameters in which they differ most"
@@ -92,9 +97,9 @@ def _ends(posterior: Posterior, i: int, size: float) -> tuple[float, float]:
     return size * (posterior.mean[i] - reach), size * (posterior.mean[i] + reach)
 
 
-def _draw_density(ax: Axes, at: Array, x: float, deviation: float, look: Look) -> None:
-    """Draws the density of a Gaussian, if it has one."""
+def _draw_density(ax: Axes, at: Array, x: float, deviation: float, look: Look, first: int) -> None:
+    """Draws the density of a Gaussian, if it has one, with markers from place `first` on."""
     if deviation > 0 and np.isfinite(x):
         area = deviation * np.sqrt(2 * np.pi)
         density = np.exp(-0.5 * ((at - x) / deviation) ** 2)
-        ax.plot(at, density / area, color=look.color, linestyle=look.line["linestyle"])
+        ax.plot(at, density / area, markevery=(first, MARKED_EVERY), **look.line)

@@ -218,6 +218,20 @@ def title(ax: Axes, words: str) -> None:
     ax.set_title(_cut(words, title_letters(ax)).replace("$", r"\$"))
 
 
+def titles(axes: Iterable[Axes], words: Sequence[str]) -> None:
+    """Sets the titles of panels, cut at their ends, or at their starts if only ends tell them
+    apart."""
+    panels = list(axes)[: len(words)]
+    for ax, text in zip(panels, words, strict=True):
+        title(ax, text)
+    if len({ax.get_title() for ax in panels}) == len(set(words)):
+        return
+    for ax, text in zip(panels, words, strict=True):
+        most = title_letters(ax)
+        end = text if len(text) <= most else f"…{text[1 - most :]}"
+        ax.set_title(end.replace("$", r"\$"))
+
+
 def title_letters(ax: Axes) -> int:
     """Estimates how many letters fit a panel's title."""
     return max(12, int(_room(ax, "axes.titlesize")) + 3)
