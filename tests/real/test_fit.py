@@ -18,7 +18,7 @@ from ipe_bench.noise import Gaussian, Quantization, Unknown
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.fits import fit
 from ipe_bench.real.logs import Log
-from ipe_bench.report.page.answer import _interval, with_error
+from ipe_bench.report.page.answer import between, with_error
 from ipe_bench.solvers import Newton, Progressive
 from ipe_bench.trials.scenario import Scenario
 
@@ -130,8 +130,8 @@ def test_ends_of_an_interval_have_the_figures_of_its_width(half):
     """About the middle of an interval they are those without an estimate, and the ends are off by
     at most half a hundredth of what lies between them."""
     low, high = 5.0 - half, 5.0 + half
-    shown = _interval(low, high, 5.0)
-    assert shown == _interval(low, high, float("nan"))
+    shown = between(low, high, 5.0)
+    assert shown == between(low, high, float("nan"))
     ends = [float(end) for end in shown.split(" … ")]
     np.testing.assert_allclose(ends, [low, high], rtol=0, atol=0.005 * (high - low))
 
