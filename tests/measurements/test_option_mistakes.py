@@ -65,7 +65,7 @@ MISTAKES = [
     (lambda: Correlated(1.0, 0.5, block=7).covariance(10), "block=7"),
     (lambda: Correlated(matrix=((1.0, 2.0), (2.0, 1.0))).covariance(2), "matrix"),
     (lambda: Correlated(matrix=((1.0,),)).covariance(2), "matrix"),
-    (lambda: _line(t="0:8").m, r"columns\.t=0:8: give a list, such as \[1,2,3\]"),
+    (lambda: _line(t="0:8").m, r"columns\.t=0:8: give a list"),
     (lambda: _line(t=()).m, r"measurement\.columns\.t=\(\): give numbers"),
 ]
 

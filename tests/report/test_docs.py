@@ -684,7 +684,8 @@ def site(tmp_path_factory) -> tuple[Path, str]:
     # In a process of its own, as a user builds it: what its libraries will do away with is no error
     # of ours.
     command = [sys.executable, pages.__file__, str(folder), "--trials=1"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    here = {**os.environ, "PYTHONPATH": str(Path(pages.__file__).parents[1])}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=here)
     assert done.returncode == 0, done.stderr
     return folder / "html", done.stdout
 
