@@ -121,10 +121,10 @@ def test_a_change_to_states_that_move_makes_stale_what_is_computed_with_them_and
     copy, before
 ):
     # Filters of constants linearise as trackers do; bounds of states are those of a filter and of a
-    # smoother.
+    # smoother, and where readings fold those of a grid, which is built on particles' densities.
     changed = {"states/linearisation.py": {"track", "path", "ukf"}}
     changed |= {"states/trackers.py": {"track", "path"}, "trials/paths.py": {"track", "path"}}
-    changed |= {"states/smoothers.py": {"track", "path"}, "states/particles.py": set()}
+    changed |= {"states/smoothers.py": {"track", "path"}, "states/particles.py": {"track", "path"}}
     for module, stale in changed.items():
         edit(
             copy / "ipe_bench" / module, "import numpy as np\n", "import numpy as np\nFACTOR = 2\n"
