@@ -235,7 +235,7 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
     try:
         found = OverridesParser.create().parse_override(word)
     except (HydraException, ValueError, RecursionError):
-        if any(value.count(one) != value.count(other) for one, other in ("[]", "{}", "()")):
+        if any(value.count(one) != value.count(other) for one, other in ("[]", "{}")):
             raise UserError(
                 f"{word}: the brackets do not match; close each, and quote the whole word if it"
                 " contains blanks"
