@@ -453,7 +453,7 @@ class _Reader:
         what = f"the formula of {', '.join(names)}"
         self._refuse_bare(names)
         if not columns and len(self._free([])) > 1:
-            self._refuse_without_column(names, usual)
+            self._refuse_without_column(names, self._typed("measurement.reading") or usual)
         reading = self._reading(what, columns, usual)
         if not starts and not typed:
             raise UserError(

@@ -146,6 +146,10 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
             " estimate 'a*t+b' volt.csv measurement.reading=volt",
         ),
         (
+            ["a*tt+b", "warm.csv", "measurement.reading=temp"],
+            "estimate 'a*t+b' warm.csv measurement.reading=temp 'ignore_columns=[volt]'",
+        ),
+        (
             ["volt = a*x+b", "warm.csv"],
             "write the column that the readings depend on in the formula of a, x, b",
         ),
