@@ -20,6 +20,18 @@ def white_acceleration(step: float, density: float) -> Array:
     return density * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
 
 
+SQUARE = Formulas(
+    next={"x": "0.95*x + w"},
+    readings={"z": "x**2"},
+    noise={"w": 0.3},
+    deviation={"z": 0.3},
+    start={"x": 0.5},
+    spread={"x": 1.0},
+    count=12,
+)
+"""A state that is read by its square, which leaves the sign open."""
+
+
 def straight_line(spread: float, deviation: float) -> Formulas:
     """A line through ten readings, of whose value and slope the prior says so much."""
     return Formulas(

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth
+from shared.state_models import SQUARE, ConstantVelocity, CoordinatedTurn, Growth
 
 import ipe_bench as ib
 from ipe_bench.states import (
@@ -40,15 +40,6 @@ BY_STATE = Formulas(
     deviation={"z": "0.1 + 0.5*abs(x)"},
     spread={"x": 1.0, "offset": 0.1},
     count=20,
-)
-SQUARE = Formulas(
-    next={"x": "0.95*x + w"},
-    readings={"z": "x**2"},
-    noise={"w": 0.3},
-    deviation={"z": 0.3},
-    start={"x": 0.5},
-    spread={"x": 1.0},
-    count=12,
 )
 NOISY = replace(SQUARE, readings={"z": "x"}, deviation={"z": "sqrt(0.01 + x**2/4)"})
 VOLATILITY = replace(SQUARE, readings={"z": "0"}, deviation={"z": "exp(x/2)"})

@@ -10,14 +10,20 @@ import pytest
 from scipy.optimize._numdiff import approx_derivative
 from scipy.stats import chi2, kstest
 from shared.oracles import assert_agrees
-from shared.state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum, path_cost
+from shared.state_models import (
+    SQUARE,
+    ConstantVelocity,
+    CoordinatedTurn,
+    Growth,
+    Pendulum,
+    path_cost,
+)
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import options
 from ipe_bench.states import (
     Cubature,
-    Formulas,
     Grid,
     IteratedSmoother,
     LevenbergMarquardtSmoother,
@@ -330,15 +336,6 @@ def test_a_path_that_has_arrived_waits_for_the_others(rule):
         assert alone.calls[0] == together.calls[trial]
 
 
-SQUARE = Formulas(
-    next={"x": "0.95*x + w"},
-    readings={"z": "x**2"},
-    noise={"w": 0.3},
-    deviation={"z": 0.3},
-    start={"x": 0.5},
-    spread={"x": 1.0},
-    count=12,
-)
 EVEN = replace(SQUARE, readings={"z": "x"})
 
 
