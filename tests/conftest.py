@@ -43,8 +43,8 @@ def _handlers_of_this_test():
 
 @pytest.fixture
 def ipe_bench(monkeypatch, capsys, tmp_path):
-    """Runs a command in an empty folder, whose plugins are forgotten afterwards: its exit code,
-    stdout and stderr."""
+    """Runs a command in an empty folder, whose modules and plugins are forgotten afterwards: its
+    exit code, stdout and stderr."""
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONPATH"):
         monkeypatch.setenv(variable, "1" if variable != "PYTHONPATH" else "")
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -60,6 +60,9 @@ def ipe_bench(monkeypatch, capsys, tmp_path):
 
     yield run
     discovery.sources.cache_clear()
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None)).startswith(str(tmp_path)):
+            del sys.modules[name]
 
 
 @pytest.fixture
