@@ -2,6 +2,7 @@
 none."""
 
 import itertools
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -61,6 +62,22 @@ def test_signed_rank_counts_every_choice_of_signs_where_ranks_are_tied():
     seen = ranks @ (d > 0)
     tail = min(np.mean(np.array(sums) <= seen), np.mean(np.array(sums) >= seen))
     assert_agrees(p_of(d), 2 * tail, rtol=1e-12)
+
+
+def test_signed_rank_of_many_tied_ranks_counts_every_choice_of_signs():
+    """Twenty differences of few sizes, where the normal law is 0.02 off."""
+    d = np.round(2 * (np.random.default_rng(0).standard_normal(24) + 0.25))
+    d = d[d != 0][:20]
+    ranks = stats.rankdata(np.abs(d))
+    ways = Counter({0: 1})
+    for rank in ranks:
+        ways = Counter({s: ways[s] + ways[s - rank] for s in {*ways, *(t + rank for t in ways)}})
+    seen = min(ranks @ (d > 0), ranks @ (d < 0))
+    exact = 2 * sum(number for total, number in ways.items() if total <= seen) / 2 ** len(d)
+    assert p_of(d) == pytest.approx(exact, rel=1e-12)
+    assert abs(exact - stats.wilcoxon(d, method="asymptotic").pvalue) > 0.015
+    tieless = 1000 * np.random.default_rng(3).standard_normal(50) + 200
+    assert p_of(tieless) == pytest.approx(stats.wilcoxon(tieless, method="exact").pvalue, rel=1e-9)
 
 
 @pytest.mark.oracle("library: SciPy's binomtest", "p of McNemar's exact test", 1e-12)

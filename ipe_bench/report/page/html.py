@@ -14,7 +14,7 @@ from ipe_bench.report.tables.matrix import MATRIX, SUCCESS, Matrix
 from ipe_bench.report.tables.table import Part, Strong, Table, environment, words
 from ipe_bench.report.words import counted, public
 from ipe_bench.runs.parts import TRUTH
-from ipe_bench.statistics.comparisons import TIE
+from ipe_bench.statistics.comparisons import EXACT, TIE
 from ipe_bench.statistics.records import SCORES, STATISTICS
 from ipe_bench.statistics.registry import all_statistics
 
@@ -204,9 +204,9 @@ DEFINITIONS: dict[str, str] = {
         " tie, because estimators that share a root differ by round-off alone."
     ),
     "p of error": (
-        "Wilcoxon's two-sided signed-rank test without ties (Biometrics Bulletin 1, 1945), with"
-        " Holm's correction over the pairs of a scenario (Scandinavian Journal of Statistics 6,"
-        " 1979)."
+        "Wilcoxon's two-sided signed-rank test without ties (Biometrics Bulletin 1, 1945), exact up"
+        f" to {EXACT} trials, with Holm's correction over the pairs of a scenario (Scandinavian"
+        " Journal of Statistics 6, 1979)."
     ),
     "p of success": (
         "McNemar's exact test on the trials in which only one of the two succeeds (Psychometrika"
