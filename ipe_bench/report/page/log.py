@@ -55,8 +55,8 @@ _OF_GATES = (
 _OF_CONSTANTS = (
     f"Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
     " the innovations, so only whiteness tests the model. Intervals of uncertain deviations are"
-    " profiles of the likelihood; of one that is held at 0, up to where it is 1.35 lower (95 %,"
-    " one-sided)."
+    " profiles of the likelihood, down to where it is 1.92 lower; of one that is held at 0, they"
+    " hold in 95 % of all logs, and in less of those in which it is held."
 )
 _STORED = (
     *("lost_from", "effective", "message", "notes", "mean_nis", "limits", "verdict"),
