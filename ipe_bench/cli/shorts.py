@@ -504,7 +504,11 @@ class _Reader:
             states = content["next"] if isinstance(content["next"], dict) else {}
             self._require_complete(file, content, "state_model", Formulas)
             model = f"Model: states {enumerate_few(list(states))} of {file}, which move."
-            return self._short(words, [model, f"Log: {files}, a row per epoch."])
+            log = f"Log: {files}, a row per epoch"
+            if self._is_timed(content):
+                words += ["state_model.inputs.time=0"]
+                log += "; its column time has the times, and dt is the step"
+            return self._short(words, [model, f"{log}."])
         if "rates" in keys:
             from ipe_bench.measurements.ode.described import Ode
 
@@ -517,6 +521,13 @@ class _Reader:
             f"{file}: is no model: it has neither next: (a state model by formulas) nor rates:"
             f" (differential equations); {there}"
         )
+
+    def _is_timed(self, content: dict[str, Any]) -> bool:
+        """Tells if a state model's formulas name times that only the column time of its log has."""
+        typed = self._typed("state_model.inputs.time") or self._typed("state_model.step")
+        told = typed or "step" in content or "time" in content.get("inputs", {})
+        clock = {"t", "dt"} & set(_names(content)) - _defined(content)
+        return bool(clock) and "time" in self._free([]) and not told
 
     def _require_complete(self, file: str, content: dict[str, Any], group: str, cls: type) -> None:
         """Refuses a file with keys that mean nothing, or without those that are needed."""
@@ -550,12 +561,21 @@ class _Reader:
 
 def _undefined(content: dict[str, Any]) -> list[str]:
     """Lists the names in the formulas of a state model that its file does not define."""
-    known = {"k", "t", "dt"}
-    for key in ("next", "noise", "inputs", "constants"):
-        known |= set(content.get(key, {}))
+    known = {"k", "t", "dt", *_defined(content)}
+    return [name for name in _names(content) if name not in known]
+
+
+def _defined(content: dict[str, Any]) -> set[str]:
+    """Lists the names that a state model's file gives a meaning."""
+    kinds = ("next", "noise", "inputs", "constants")
+    return {name for kind in kinds for name in content.get(kind, {})}
+
+
+def _names(content: dict[str, Any]) -> list[str]:
+    """Lists the names in the formulas of a state model's file."""
     formulas = [*content.get("next", {}).values(), *content.get("readings", {}).values()]
     names = [name for text in formulas for name in parse(str(text), "formula").names]
-    return [name for name in dict.fromkeys(names) if name not in known]
+    return list(dict.fromkeys(names))
 
 
 def _is_short(name: str, column: str) -> bool:

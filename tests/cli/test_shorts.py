@@ -22,6 +22,15 @@ FILES = {
     "broken.py": "def f(t, a=1.0:\n    return a\n",
     "car.yaml": "next: {x: x + w}\nnoise: {w: 0.1}\nreadings: {z: x}\ndeviation: {z: 0.5}\n"
     "spread: {x: 2}\n",
+    "cart.yaml": "next: {x: x + dt*v, v: v + w}\nnoise: {w: 0.1}\nreadings: {z: x}\n"
+    "deviation: {z: 0.5}\nspread: {x: 2, v: 1}\n",
+    "clocked.yaml": "next: {x: x + u*t + w}\nnoise: {w: 0.1}\nreadings: {z: x}\ninputs: {u: 1}\n"
+    "deviation: {z: 0.5}\nspread: {x: 2}\n",
+    "stepped.yaml": "next: {x: x + dt*w}\nnoise: {w: 0.1}\nreadings: {z: x}\nstep: 2\n"
+    "deviation: {z: 0.5}\nspread: {x: 2}\n",
+    "own.yaml": "next: {x: x + dt*w}\nnoise: {w: 0.1}\nreadings: {z: x}\nconstants: {dt: 2}\n"
+    "deviation: {z: 0.5}\nspread: {x: 2}\n",
+    "uneven.csv": "time,u,z\n0,1,1\n1,1,2\n4,1,3\n",
     "free.py": "def fall(t, h, v):\n    return h + v * t\n",
     "bare.yaml": "next: {x: x + w}\nreadings: {z: x}\n",
     "wrong.yaml": "next: {x: x + w}\nnoises: {w: 0.1}\nreadings: {z: x}\ndeviation: {z: 0.5}\n"
@@ -99,6 +108,19 @@ def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: s
         (
             ["car.yaml", "readings=log.csv"],
             "state_model=formulas state_model.file=car.yaml readings='log.csv'",
+        ),
+        *(
+            (
+                [file, "uneven.csv"],
+                f"state_model=formulas state_model.file={file}{times} readings='uneven.csv'",
+            )
+            for file, times in {
+                "cart.yaml": " state_model.inputs.time=0",
+                "clocked.yaml": " state_model.inputs.time=0",
+                "stepped.yaml": "",
+                "own.yaml": "",
+                "car.yaml": "",
+            }.items()
         ),
         (["measurement=ranging", "my.csv"], "measurement=ranging readings='my.csv'"),
         (
