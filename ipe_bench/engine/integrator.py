@@ -23,7 +23,9 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores
 from ipe_bench.engine import compiled
 from ipe_bench.engine.compiled import INTEGER, POINTER, WHOLE, aligned, at
-from ipe_bench.engine.plan import Equations, StepPlan, Tableau, planned
+from ipe_bench.engine.equations import Equations
+from ipe_bench.engine.plan import StepPlan, planned
+from ipe_bench.engine.tableaus import Tableau
 from ipe_bench.engine.trace import Program, RowPrograms
 
 if TYPE_CHECKING:

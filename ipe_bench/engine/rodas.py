@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.engine.plan import Equations, Recording
+from ipe_bench.engine import watch
+from ipe_bench.engine.equations import Equations, Recording
 from ipe_bench.engine.trace import Program, tangent
 
 GAMMA = 0.21193756319429014
@@ -166,7 +167,7 @@ class Rodas5P:
             "df": Program.of(tangent(tape.slope, along), point + ways),
             "dft": Program.of(tangent(in_time, along), point + ways),
             "dJk": Program.of(tangent(turned, along), [*point, *k, *ways]),
-            "side": Program.of([tape.side], point),
+            "side": Program.of([watch.side_of_poles(tape)], point),
             "start": Program.of(tape.start, began),
             "dstart": Program.of(tangent(tape.start, along), [*began, *d]),
             "read": Program.of(tape.shown, point),
@@ -181,7 +182,7 @@ class Rodas5P:
     @cached_property
     def divided(self) -> bool:
         """Whether the rates divide by anything that changes along a solution."""
-        return bool(Recording(self.of.equations).divisors)
+        return bool(watch.divisors(Recording(self.of.equations)))
 
     def measured(self, x: Array) -> tuple[Array, Effort]:
         """Computes the readings (1, m) at x (1, n), and the effort; a tolerance that shows the

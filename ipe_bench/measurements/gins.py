@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
+from ipe_bench.engine.equations import Equations, Variation
 from ipe_bench.engine.integrator import Kernel
-from ipe_bench.engine.plan import DOP853, Equations, Variation
+from ipe_bench.engine.tableaus import DOP853
 from ipe_bench.engine.trace import tangent
 from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, parameter_table
 from ipe_bench.measurements.ode.model import OdeMeasurement

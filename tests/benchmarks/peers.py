@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.engine.plan import DOP853, Recording
+from ipe_bench.engine.equations import Recording
+from ipe_bench.engine.tableaus import DOP853
 from ipe_bench.engine.trace import Program
 from ipe_bench.measurements.ode.model import OdeMeasurement
 

@@ -11,7 +11,7 @@ from shared.oracles import agreed, assert_agrees
 from shared.slopes import differentiate
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.engine import plan
+from ipe_bench.engine import tableaus
 from ipe_bench.engine.ladder import tangent_contraction
 from ipe_bench.engine.trace import Graph
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
@@ -59,9 +59,9 @@ class Cases(Pulse):
 
 @pytest.mark.oracle("library: SciPy's DOP853", "coefficients of the Runge-Kutta method", 0.0)
 def test_the_coefficients_are_those_of_scipy():
-    for mine, theirs in ((plan.DOP853.B, DOP853.B[:12]), (plan.DOP853.C, DOP853.C[:12])):
+    for mine, theirs in ((tableaus.DOP853.B, DOP853.B[:12]), (tableaus.DOP853.C, DOP853.C[:12])):
         assert_agrees(mine, theirs)
-    for s, row in enumerate(plan.DOP853.A):
+    for s, row in enumerate(tableaus.DOP853.A):
         assert_agrees(row, DOP853.A[s, :s])
 
 

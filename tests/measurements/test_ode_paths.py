@@ -17,7 +17,7 @@ from scipy.special import erf, erfc
 from shared.by_numpy import by_numpy
 
 from ipe_bench.engine.ladder import tangent_contraction
-from ipe_bench.engine.plan import DOP853
+from ipe_bench.engine.tableaus import DOP853
 from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter, SubsetModel
 from ipe_bench.measurements.arithmetic import FUNCTIONS, PAIRS, SEVERAL
 from ipe_bench.measurements.joint import Joint

@@ -12,8 +12,9 @@ from unittest.mock import patch
 
 import numpy as np
 
+from ipe_bench.engine import watch
+from ipe_bench.engine.equations import Recording
 from ipe_bench.engine.integrator import Kernel
-from ipe_bench.engine.plan import Recording
 from ipe_bench.engine.rows import RowFunction
 from ipe_bench.engine.scan import Step
 from ipe_bench.engine.trace import Program
@@ -88,13 +89,16 @@ def _programs(kernel):
     d, dp, slopes, shown, starts = [], [], [], tape.shown, []
     if kernel.sensitive:
         # Each number is a tangent in all directions at once, an array (n, lanes).
-        d, dp, slopes, shown, starts = tape.tangents
+        along = tape.deviations
+        d, dp, slopes, shown, starts = along.d, along.dp, along.slope, along.shown, along.start
     stays = [*tape.p, *tape.c, *dp]
     at = [tape.t, *tape.y, *d, *stays]
-    watched = kernel.equations.watched and not kernel.sensitive
-    moving = Program.of([*tape.slope, *slopes, *([tape.side] if watched else [])], at)
-    noted = tape.noted if watched else []
-    return Program.of([*tape.start, *starts, *noted], stays), moving, Program.of(shown, at)
+    sides, watch_begun = [], []
+    if kernel.equations.watched and not kernel.sensitive:
+        sides = [watch.side_of_poles(tape)]
+        watch_begun = watch.begun(tape, *sides)
+    moving = Program.of([*tape.slope, *slopes, *sides], at)
+    return Program.of([*tape.start, *starts, *watch_begun], stays), moving, Program.of(shown, at)
 
 
 def integrate(
@@ -122,12 +126,9 @@ def integrate(
         return [*p, *intervals[min(k, len(intervals) - 1), case].T, *directions]
 
     with np.errstate(all="ignore"):
-        begun, t, size = (
-            begin(stays(0)),
-            np.float64(0.0),
-            len(slope.outputs) - bool(self.plan.doubt),
-        )
-        y, noted = begun[:size], begun[size:]
+        begun, t, watching = begin(stays(0)), np.float64(0.0), self.plan.watch
+        size = len(slope.outputs) - (watching is not None)
+        y, watched = begun[:size], begun[size:]
         kept = [y]
         for k, to in enumerate(times):
             # Equal steps to the next reading; none to a time that is reached already.
@@ -146,15 +147,14 @@ def integrate(
                         found = slope([moment, *at, *stays(k)])
                         slopes.append(found[:size])
                         sides += found[size:]
-                        if noted and self.plan.timed:
+                        if watching is not None and watching.timed:
                             # What the rates do with the states held is the time's doing, and no
                             # doubt.
                             held += slope([moment, *y, *stays(k)])[:size]
                 y = at
-                if noted:
-                    noted = self.plan.watch(
-                        [h, *y, *itertools.chain(*slopes), *held, *sides, *noted]
-                    )
+                if watching is not None:
+                    rates = itertools.chain(*slopes, held)
+                    watched = watching.program([h, *y, *rates, *sides, *watched])
             # The readings are taken with the constants that hold from this time on.
             t = to
             kept.append(y)
@@ -168,5 +168,5 @@ def integrate(
         if states is not None:
             for k, i in np.ndindex(len(kept), len(kept[0])):
                 states[trial, case, i, k] = kept[k][i]
-            if noted:
-                states[trial, case, -1] = np.broadcast_to(noted[-1], len(trial))[:, None]
+            if watching is not None:
+                states[trial, case, -1] = np.broadcast_to(watched[-1], len(trial))[:, None]

@@ -33,7 +33,7 @@ from ipe_bench.engine.emit.vectors import (
     put,
     room,
 )
-from ipe_bench.engine.plan import StepPlan
+from ipe_bench.engine.plan import LinearProgram, StepPlan, TangentPlan
 
 _FILLED = 4
 """Numbers of a tangent from which on one alone keeps the processor busy; below, two advance side by
@@ -60,27 +60,26 @@ class _Writer:
         self.weigh = self._function("weigh", [PTR, F64], self._weigh)
         self.step = self._function("step", [PTR, F64, F64], self._step)
         self.read = self._function("read", [PTR, F64], self._read)
-        if plan.tangents:
-            self._write_tangents()
+        if plan.tangents is not None:
+            self._write_tangents(plan.tangents)
         kinds = [PTR, PTR, PTR, I64, PTR, I64, I64, PTR, PTR, I64, PTR, I64, PTR, PTR, PTR]
         made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), "integrate")
         _Loops(self, made).write()
 
-    def _write_tangents(self) -> None:
-        plan = self.plan
+    def _write_tangents(self, tangents: TangentPlan) -> None:
         kinds = [PTR, PTR, PTR]
-        n = len(plan.tangents)
+        n = len(tangents.places)
         # Short tangents advance in pairs, and one alone where their number is odd.
-        paired = n - n % 2 if len(plan.tangents[0]) < _FILLED else 0
+        paired = n - n % 2 if len(tangents.places[0]) < _FILLED else 0
         groups = (0, paired, 2), (paired, n, 1)
         self.groups = [group for group in groups if group[0] < group[1]]
         self.move = {}
         for *_, by in self.groups:
-            self.move[by] = self._function(f"move{by}", kinds, partial(self._move, by))
-        self.show = self._function("show", kinds, self._show)
-        moving = [i for row in plan.motion.sources for i in row]
+            self.move[by] = self._function(f"move{by}", kinds, partial(self._move, tangents, by))
+        self.show = self._function("show", kinds, partial(self._show, tangents))
+        moving = [i for row in tangents.motion.sources for i in row]
         self.sources = self._constant("sources", I64, moving or [0], 8)
-        shown = [i for row in plan.reading.sources for i in row]
+        shown = [i for row in tangents.reading.sources for i in row]
         self.show_sources = self._constant("show_sources", I64, shown or [0], 8)
 
     def _constant(self, name: str, kind: ir.Type, values: Sequence[Any], align: int) -> Value:
@@ -145,36 +144,44 @@ class _Writer:
             times.append(time)
             result = v.run(plan.step, [time, *at, *fixed])
             slopes.append(result[: len(plan.y)])
-            if plan.doubt:
+            if plan.watch is not None:
                 sides.append(result[-1])
-            else:
-                v.store(result[len(plan.y) :], frame, plan.kept[s])
+            if plan.tangents is not None:
+                v.store(result[len(plan.y) :], frame, plan.tangents.kept[s])
         # The end of the step, y + h sum_s B_s k_s.
         ended = v.combine(y, weights[-1], [slopes[j] for j, _ in plan.tableau.weights[-1]])
         v.store(ended, frame, plan.y)
-        if plan.doubt:
+        if plan.watch is not None:
             held = []
-            if plan.timed:
+            if plan.watch.timed:
                 # The rates of the stages' moments with the state held, where they depend on the
                 # time itself.
                 held = [v.run(plan.rates, [time, *y, *fixed]) for time in times]
-            places = [*plan.reach, *plan.side, *plan.doubt]
             moved = itertools.chain(*slopes, *held)
+            places = plan.watch.carried
             given = [v.spread(h), *ended, *moved, *sides, *v.load(frame, places)]
-            v.store(v.run(plan.watch, given), frame, places)
+            v.store(v.run(plan.watch.program, given), frame, places)
 
     def _read(self, v: Vectors, frame: Value, t: Value) -> None:
         plan = self.plan
         given = [v.spread(t), *v.load(frame, [*plan.y, *plan.driven, *plan.fixed])]
-        v.store(v.run(plan.read, given), frame, plan.noted)
+        v.store(v.run(plan.read, given), frame, plan.left)
 
-    def _move(self, together: int, v: Vectors, frame: Value, first: Value, driving: Value) -> None:
+    def _move(
+        self,
+        tangents: TangentPlan,
+        together: int,
+        v: Vectors,
+        frame: Value,
+        first: Value,
+        driving: Value,
+    ) -> None:
         """Writes one step of some tangents; `driving` points to the places of their sources."""
         plan = self.plan
-        move = plan.motion
+        move = tangents.motion
         weights = self._weights(v, frame)
         one = range(together)
-        d = len(plan.tangents[0])
+        d = len(tangents.places[0])
         count = len(move.sources[0])
         own = [range(k * d, (k + 1) * d) for k in one]
         y = [v.load(first, place) for place in own]
@@ -187,7 +194,7 @@ class _Writer:
         for s, row in enumerate(plan.tableau.weights[:-1]):
             # The stages of the variational equations, by what the state's own stages have kept.
             at = [v.combine(y[k], weights[s], [slopes[k][j] for j, _ in row]) for k in one]
-            stage = v.place(frame, s * plan.stage_size)
+            stage = v.place(frame, s * tangents.stage_size)
             saved = v.load(stage, move.saved)
             for k in one:
                 given = [*at[k], *v.load(stage, places[k]), *saved, *fixed]
@@ -197,12 +204,14 @@ class _Writer:
             ended = v.combine(y[k], weights[-1], [slopes[k][j] for j, _ in last])
             v.store(ended, first, own[k])
 
-    def _show(self, v: Vectors, frame: Value, first: Value, driving: Value) -> None:
+    def _show(
+        self, tangents: TangentPlan, v: Vectors, frame: Value, first: Value, driving: Value
+    ) -> None:
         plan = self.plan
-        show = plan.reading
+        show = tangents.reading
         indices = range(len(show.sources[0]))
         places = [number_at(v.builder, driving, integer(i), I64) for i in indices]
-        moved = v.load(first, range(len(plan.tangents[0])))
+        moved = v.load(first, range(len(tangents.places[0])))
         given = [*moved, *v.load(frame, [*places, *show.saved, *plan.fixed])]
         v.store(v.run(show.program, given), frame, plan.shown)
 
@@ -255,13 +264,16 @@ class _Loops:
         """Returns the pointer to one number in a vector of the frame."""
         return self.b.add(integer(place * self.width), lane)
 
-    def _tangent(self, j: Value, table: Value, sources: Sequence[Sequence[int]]) -> list[Value]:
+    def _tangent(
+        self, j: Value, table: Value, tangents: TangentPlan, linear: LinearProgram
+    ) -> list[Value]:
         """Returns pointers to tangent j and to the list of its sources."""
         b = self.b
-        size = integer(len(self.plan.tangents[0]))
-        lies = b.add(integer(self.plan.tangents[0].start), b.mul(j, size))
+        first = tangents.places[0]
+        lies = b.add(integer(first.start), b.mul(j, integer(len(first))))
         place = Vectors(b, self.width).place(self.frame, lies)
-        return [place, b.gep(table, [b.mul(j, integer(len(sources[0])))], source_etype=I64)]
+        sources = b.mul(j, integer(len(linear.sources[0])))
+        return [place, b.gep(table, [sources], source_etype=I64)]
 
     def _gather(self, group: Value, lane: Value) -> None:
         """Writes the numbers of a lane into the frame, a vector for each."""
@@ -290,7 +302,7 @@ class _Loops:
         put(b, b.mul(case, self.stride), self.shift, lane)
         put(b, constants, self.own, lane)
         moments = b.add(self.n_times, integer(1))
-        size = integer(len(plan.y) + len(plan.doubt))
+        size = integer(len(plan.told))
         put(b, b.mul(b.mul(place, moments), size), self.kept, lane)
 
     def _keep(self, k: Value) -> None:
@@ -299,7 +311,7 @@ class _Loops:
         asked = b.icmp_signed("!=", b.ptrtoint(self.states, I64), integer(0))
         with b.if_then(asked), self._lanes() as lane:
             row = b.add(number_at(b, self.kept, lane, I64), k)
-            for place in (*self.plan.y, *self.plan.doubt):
+            for place in self.plan.told:
                 put(b, number_at(b, self.frame, self._at(place, lane)), self.states, row)
                 row = b.add(row, b.add(self.n_times, integer(1)))
 
@@ -307,6 +319,7 @@ class _Loops:
         """Writes the steps to a reading's time: h = (times[k] - t) / steps[k]."""
         b = self.b
         writer = self.writer
+        tangents = self.plan.tangents
         since = b.load(self.t, typ=F64)
         # No step to a time that is reached already: at the start, or where two readings share one.
         there = b.fcmp_ordered("==", to, since)
@@ -320,10 +333,11 @@ class _Loops:
         with loop(b, integer(0), count) as s:
             time = b.fadd(since, b.fmul(b.sitofp(s, F64), h))
             b.call(writer.step, [self.frame, time, h])
-            for begin, end, by in writer.groups if self.plan.tangents else ():
-                with loop(b, integer(begin), integer(end), by) as j:
-                    tangent = self._tangent(j, writer.sources, self.plan.motion.sources)
-                    b.call(writer.move[by], [self.frame, *tangent])
+            if tangents is not None:
+                for begin, end, by in writer.groups:
+                    with loop(b, integer(begin), integer(end), by) as j:
+                        moved = self._tangent(j, writer.sources, tangents, tangents.motion)
+                        b.call(writer.move[by], [self.frame, *moved])
         b.store(to, self.t)
 
     def _drive(self, k: Value) -> None:
@@ -344,18 +358,19 @@ class _Loops:
         of `out`."""
         b = self.b
         plan = self.plan
+        tangents = plan.tangents
         columns = integer(self.columns)
         done = b.mul(k, integer(len(plan.shown)))
         with loop(b, integer(0), columns) as j:
-            if plan.tangents:
-                tangent = self._tangent(j, self.writer.show_sources, plan.reading.sources)
-                b.call(self.writer.show, [self.frame, *tangent])
+            if tangents is not None:
+                shown = self._tangent(j, self.writer.show_sources, tangents, tangents.reading)
+                b.call(self.writer.show, [self.frame, *shown])
             with self._lanes() as lane:
                 begin = number_at(b, self.target, lane, I64)
                 less = b.add(number_at(b, self.shift, lane, I64), done)
                 for i, place in enumerate(plan.shown):
                     value = number_at(b, self.frame, self._at(place, lane))
-                    if plan.tangents:
+                    if tangents is not None:
                         value = b.fmul(value, number_at(b, self.si, j))
                     else:
                         offset = number_at(b, self.offset, b.add(less, integer(i)))

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, finite, own
-from ipe_bench.engine import ladder
+from ipe_bench.engine import ladder, watch
+from ipe_bench.engine.equations import Equations, Recording, Variation
 from ipe_bench.engine.integrator import Kernel, compiled_rates
-from ipe_bench.engine.plan import DOP853, RK4, Equations, Recording, Variation, jumps
+from ipe_bench.engine.jumps import jumps
 from ipe_bench.engine.rodas import MOST_STEPS, SHAPE, STABLE, Effort, Rodas5P, Stepped
+from ipe_bench.engine.tableaus import DOP853, RK4
 from ipe_bench.engine.trace import Graph, Program
 from ipe_bench.measurements.base import Measurement, with_unit
 
@@ -366,7 +368,7 @@ class OdeMeasurement(Measurement):
         """Selects the states that the rates divide by; none where no state is held against
         another."""
         states = self._kept[1]
-        return np.array(Recording(self.equations).divided_by[:states], dtype=bool)
+        return np.array(watch.divided_by(Recording(self.equations))[:states], dtype=bool)
 
     @cached_property
     def _finest(self) -> Array:
