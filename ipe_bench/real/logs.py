@@ -25,6 +25,7 @@ from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel, require_parts
 from ipe_bench.states.copies import SURE
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
+from ipe_bench.states.left_out import Expected
 from ipe_bench.states.lost import why_lost
 from ipe_bench.states.particles import Bootstrap
 from ipe_bench.states.redone import unchanged
@@ -348,7 +349,8 @@ class LogTracks:
             share = float(gated.sum() / (~missing).sum())
             missing |= gated
         if missing.any():
-            h, spread = _readings_at(log.model, tracks)
+            h, of_states, noise = Expected.at(log.model, tracks)
+            spread = np.sqrt(of_states + noise)
             predicted = np.where(missing, h, predicted)
             predicted_deviation = np.where(missing, spread, predicted_deviation)
         nis = np.where(tracks.degrees[0] > 0, tracks.nis[0], np.nan)
@@ -430,22 +432,6 @@ class LogTracks:
         if self.mean_nis > high:
             return OVERCONFIDENT
         return TOO_CAUTIOUS if self.mean_nis < low else CONSISTENT
-
-
-def _readings_at(model: StateModel, tracks: Tracks) -> tuple[Array, Array]:
-    """Computes the readings (1, K, m) that are expected at the states of a track, and their
-    standard deviations, with those of the readings themselves."""
-    expected = []
-    variances = []
-    for k in range(model.epochs):
-        x = tracks.mean[:, k]
-        with np.errstate(all="ignore"):
-            h, H = model.observation_at(k).slope(x)
-        R = model.R_at(x, k) if model.R_by_state else model.R(k)
-        P = tracks.covariance[:, k]
-        expected.append(h)
-        variances.append(np.diagonal(H @ P @ H.swapaxes(1, 2) + R, axis1=1, axis2=2))
-    return np.stack(expected, axis=1), np.sqrt(np.stack(variances, axis=1))
 
 
 def _second(log: Log, tracks: Tracks) -> list[str]:

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import gather, put, take
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Quantile
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.damped import Descent, LevenbergMarquardtSmoother
 from ipe_bench.states.folds import calls, exact_tracks, grid_of, may_fold
+from ipe_bench.states.left_out import leaving_out
 from ipe_bench.states.linearisation import Taylor, Unscented
 from ipe_bench.states.mirrored import in_first_turn, mirrored, ordered, with_second
 from ipe_bench.states.trackers import Filter, Tracker, Tracks, passed, smoothed
@@ -59,6 +61,8 @@ class AutoTracker(Tracker):
     smooths: ClassVar[bool] = True
     descent: LevenbergMarquardtSmoother = field(default_factory=LevenbergMarquardtSmoother)
     """The steps, what counts as improbable, and the rounds of draws."""
+    gate: Quantile | None = None
+    """As that of the steps; on a grid as that of a grid."""
 
     def hindrance(self, model: StateModel) -> str | None:
         why = Filter().hindrance(model)
@@ -68,14 +72,14 @@ class AutoTracker(Tracker):
         tracks, first = passed(model, z, Taylor())
         if may_fold(model):
             tracks.calls += calls(model)
-        exact, rows = exact_tracks(model, z, first)
+        exact, rows = exact_tracks(model, z, first, gate=self.gate)
         if not rows.size:
-            return self._by_paths(model, z, tracks, first)
+            return self._rest(model, z, tracks, first)
         parts = [(rows, self._told(model, exact, tracks.calls[rows]))]
         others = np.setdiff1d(np.arange(len(z)), rows)
         if others.size:
             begun = take(tracks, others), take(first, others)
-            parts.append((others, self._by_paths(model, z[others], *begun)))
+            parts.append((others, self._rest(model, z[others], *begun)))
         return gather(parts)
 
     def _told(self, model: StateModel, exact: Tracks, begun: Array) -> Tracks:
@@ -87,6 +91,7 @@ class AutoTracker(Tracker):
         tracks.calls = begun + exact.calls
         tracks.cost = exact.nis.sum(axis=1)
         tracks.stage = np.full(trials, EXACT)
+        tracks.gated = exact.gated
         if not (model.gain_by_state or model.R_by_state):
             tracks.status = np.full(trials, Status.CONVERGED, np.int8)
             tracks.iterations = np.full(trials, model.epochs)
@@ -94,6 +99,16 @@ class AutoTracker(Tracker):
             tracks.other = exact.mean
             tracks.other_p = np.full(trials, np.nan)
         return tracks
+
+    def _rest(self, model: StateModel, z: Array, tracks: Tracks, first: Tracks) -> Tracks:
+        """Tracks by paths, without the readings beyond a gate if there is one."""
+        if self.gate is None:
+            return self._by_paths(model, z, tracks, first)
+
+        def track(z: Array) -> Tracks:
+            return self._by_paths(model, z, *passed(model, z, Taylor()))
+
+        return leaving_out(track, model, z, self.gate)
 
     def _by_paths(self, model: StateModel, z: Array, tracks: Tracks, first: Tracks) -> Tracks:
         """Tracks by paths of largest density, from the smoothed tracks of the first filter."""

@@ -4,6 +4,7 @@ density from far away."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -11,11 +12,12 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import join, put, take
 from ipe_bench.basics.linalg import Array, Mask, multiply
-from ipe_bench.basics.options import Count, Positive, Share, Whole
+from ipe_bench.basics.options import Count, Positive, Quantile, Share, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.states.algebra import root
 from ipe_bench.states.base import Normal, StateModel
+from ipe_bench.states.left_out import leaving_out
 from ipe_bench.states.linearisation import Taylor, Unscented
 from ipe_bench.states.smoothers import path_p, whole
 from ipe_bench.states.trackers import Tracker, Tracks, passed
@@ -132,8 +134,13 @@ class LevenbergMarquardtSmoother(Tracker):
     """Rounds of such draws at most."""
     seed: int = 0
     """A trial's draws depend on this and on its readings: on nothing else in the batch."""
+    gate: Quantile | None = None
+    """A reading counts as missing if its squared distance from the path of all others, divided by
+    its variance, lies beyond this quantile of the chi-square with one degree, such as 0.999."""
 
     def track(self, model: StateModel, z: Array) -> Tracks:
+        if self.gate is not None:
+            return leaving_out(partial(replace(self, gate=None).track, model), model, z, self.gate)
         density = PathDensity.of(model, z)
         first, other = (
             Descent.of(density, passed(model, z, rule)[0]) for rule in (Taylor(), Unscented())

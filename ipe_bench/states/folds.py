@@ -4,6 +4,8 @@ there."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,10 +38,15 @@ def may_fold(model: StateModel) -> bool:
 
 
 def exact_tracks(
-    model: StateModel, z: Array, filtered: Tracks, smooths: bool = True
+    model: StateModel,
+    z: Array,
+    filtered: Tracks,
+    smooths: bool = True,
+    gate: float | None = None,
 ) -> tuple[Tracks, NDArray[np.intp]]:
     """Returns the tracks of a grid of those trials whose readings are folded among the states that
-    the extended filter predicts, if a grid is exact for them, and which trials these are."""
+    the extended filter predicts, if a grid is exact for them, and which trials these are; readings
+    beyond a quantile `gate` are missing."""
     if not may_fold(model):
         return Tracks.empty(model, 0), np.arange(0)
     is_open = folded(model, filtered)
@@ -50,7 +57,7 @@ def exact_tracks(
     grid = grid_of(model, smooths) if rows.size else None
     if grid is None:
         return Tracks.empty(model, 0), np.arange(0)
-    tracks = _tracked(grid, model, z[rows])
+    tracks = _tracked(replace(grid, gate=gate), model, z[rows])
     known = np.flatnonzero(np.isfinite(tracks.mean).all(axis=(1, 2)))
     return take(tracks, known), rows[known]
 

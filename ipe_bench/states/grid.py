@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import gather, take
 from ipe_bench.basics.linalg import Array, Mask, multiply
-from ipe_bench.basics.options import Count
+from ipe_bench.basics.options import Count, Quantile
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.particles import weighed
 from ipe_bench.states.passes import kept_of
@@ -62,6 +62,9 @@ class Grid(Tracker):
     """Points of the grid of an epoch."""
     smooths: bool = False
     """Whether each epoch is estimated from all readings instead of those up to it."""
+    gate: Quantile | None = None
+    """A reading counts as missing if a farther one has less than 1 less this probability, such as
+    0.999, by the density that is predicted."""
 
     def hindrance(self, model: StateModel) -> str | None:
         if self.points < 3:
@@ -158,7 +161,7 @@ class Grid(Tracker):
             predicted = p
             # Update: p(x_k | z_1..k) ~ p(z_k | x_k) p(x_k | z_1..k-1)
             x = np.repeat(steps.grids[k + 1][None, :, None], len(z), axis=0)
-            p = weighed(model, x, k, z[:, k], predicted, out)
+            p = weighed(model, x, k, z[:, k], predicted, out, self.gate)
             faults.note(p, k)
             _describe(out, k, p, steps.grids)
             if self.smooths:

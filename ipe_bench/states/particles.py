@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, multiply
-from ipe_bench.basics.options import Count
+from ipe_bench.basics.options import Count, Quantile
 from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import factor, root, transposed
 from ipe_bench.states.base import StateModel
@@ -34,6 +34,9 @@ class Bootstrap(Tracker):
     """States that stand for the density of a trial."""
     seed: int = 0
     """A trial's random numbers depend on this and on its readings: on nothing else in the batch."""
+    gate: Quantile | None = None
+    """A reading counts as missing if a farther one has less than 1 less this probability, such as
+    0.999, by the particles that are predicted."""
 
     def hindrance(self, model: StateModel) -> str | None:
         return None
@@ -58,7 +61,7 @@ class Bootstrap(Tracker):
                 noise = multiply(G, w) if model.gain_by_state else np.matmul(w, G.T)
                 x = model.transition_into(k)(x) + noise
             # By it the weights are the likelihoods, w_i ~ p(z_k | x_i).
-            weights = weighed(model, x, k, z[:, k], 1.0, out)
+            weights = weighed(model, x, k, z[:, k], 1.0, out, self.gate)
             out.effective[:, k] = 1 / np.sum(weights**2, axis=1)
             # Means and covariances of a periodic state are taken about the heaviest particle.
             heaviest = x[np.arange(trials), weights.argmax(axis=1)]
@@ -76,13 +79,27 @@ class Bootstrap(Tracker):
 
 
 def weighed(
-    model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks
+    model: StateModel,
+    x: Array,
+    k: int,
+    z: Array,
+    before: Array | float,
+    out: Tracks,
+    gate: float | None = None,
 ) -> Array:
     """Multiplies the weights `before` (trials, N) of states x (trials, N, n) by the likelihood of
     readings z (trials, m), and divides them by their sum. The track notes the logarithm of their
-    sum, and the innovation by the mean and covariance of h(x) before."""
+    sum, and the innovation by the mean and covariance of h(x) before; readings beyond the quantile
+    `gate` are missing."""
     r = residuals(model, z, x, k)
     R = model.R_at(x, k)
+    if gate is not None:
+        beyond = np.isfinite(z) & (_tails(r, R, before) < 1 - gate)
+        if out.gated is None:
+            out.gated = np.zeros(out.innovations.shape, dtype=bool)
+        out.gated[:, k] = beyond
+        z = np.where(beyond, np.nan, z)
+        r = np.where(beyond[:, None], 0.0, r)
     square, size = squares(r, z, R)
     y, L = _innovation(model, z, r, R, before)
     out.note_innovation(k, y, L, z)
@@ -99,6 +116,23 @@ def weighed(
     return w / total
 
 
+def _tails(r: Array, R: Array, before: Array | float) -> Array:
+    """Computes how probable readings (trials, m) farther out than these are, by the weights before,
+    for residuals r (trials, N, m)."""
+    from scipy.special import ndtr
+
+    below = ndtr(r / np.sqrt(np.diagonal(R, axis1=-2, axis2=-1)))
+    p = _shares(before, r)
+    low = np.sum(p * below, axis=1)
+    return 2 * np.minimum(low, np.sum(p * (1 - below), axis=1))
+
+
+def _shares(before: Array | float, r: Array) -> Array:
+    """Returns weights (trials, N, 1) of sum 1 for residuals r (trials, N, m)."""
+    p = np.broadcast_to(before, r.shape[:2])
+    return (p / p.sum(axis=1, keepdims=True))[..., None]
+
+
 def _innovation(
     model: StateModel, z: Array, r: Array, R: Array, before: Array | float
 ) -> tuple[Array, Array]:
@@ -106,8 +140,7 @@ def _innovation(
     before the readings z (trials, m), for residuals r (trials, N, m)."""
     seen = np.isfinite(z)
     both = seen[:, :, None] & seen[:, None, :]
-    p = np.broadcast_to(before, r.shape[:2])
-    p = (p / p.sum(axis=1, keepdims=True))[..., None]
+    p = _shares(before, r)
     if model.R_by_state:
         R = np.sum(p[..., None] * R, axis=1)
     if model.periods:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -199,7 +199,9 @@ class Tracker(Component, ABC):
         Raises:
             UserError: it takes no gate, with words that follow its label.
         """
-        raise UserError("takes no gate; choose a filter, or the smoother behind one")
+        if "gate" not in {one.name for one in fields(self)}:  # type: ignore[arg-type]
+            raise UserError("takes no gate; choose a filter or a smoother")
+        return replace(self, gate=gate)  # type: ignore[type-var]
 
     @abstractmethod
     def track(self, model: StateModel, z: Array) -> Tracks:
@@ -257,9 +259,6 @@ class Filter(Tracker):
             )
         return None
 
-    def gated(self, gate: float) -> Filter:
-        return replace(self, gate=gate)
-
     def track(self, model: StateModel, z: Array) -> Tracks:
         return filtered(model, z, self.rule, self.iterations, gate=self.gate)
 
@@ -276,7 +275,7 @@ def filtered(
     """Runs the filter of the model that a rule linearises about the filter's own states, or about
     those of a path; `start` replaces the prior, and readings beyond the quantile `gate` are
     missing."""
-    kind = Kind(rule, iterations, about=path is not None, gate=_most(gate))
+    kind = Kind(rule, iterations, about=path is not None, gate=gate and most_within(gate))
     return _passed(model, z, kind, path, start)[0]
 
 
@@ -309,14 +308,20 @@ def passed(
     gate: float | None = None,
 ) -> tuple[Tracks, Tracks]:
     """Does the same, for paths that are a beginning: those that have no digits are there, too."""
-    kind = Kind(rule, iterations, smooths=True, about=path is not None, gate=_most(gate))
+    kind = Kind(
+        rule,
+        iterations,
+        smooths=True,
+        about=path is not None,
+        gate=gate and most_within(gate),
+    )
     tracks, smooth = _passed(model, z, kind, path, start)
     return smooth, tracks
 
 
-def _most(gate: float | None) -> float | None:
+def most_within(gate: float) -> float:
     """Returns the squared normalised innovation at a quantile."""
-    return None if gate is None else float(chdtri(1.0, 1.0 - gate))
+    return float(chdtri(1.0, 1.0 - gate))
 
 
 def _passed(

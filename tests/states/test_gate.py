@@ -11,7 +11,18 @@ from scipy.stats import chi2
 
 import ipe_bench as ib
 from ipe_bench.report.page.log import _facts
-from ipe_bench.states import Filter, Formulas, IteratedSmoother, Smoother, Unscented, ekf
+from ipe_bench.states import (
+    AutoTracker,
+    Bootstrap,
+    Filter,
+    Formulas,
+    Grid,
+    IteratedSmoother,
+    LevenbergMarquardtSmoother,
+    Smoother,
+    Unscented,
+    ekf,
+)
 
 GATE = 0.999
 LEVEL = Formulas(
@@ -203,12 +214,67 @@ def test_chance_at_the_end_of_a_log_is_no_lost_track():
     assert all(one.share_gated > 0.2 for one in lost)
 
 
+def own_solution(model, z):
+    """The most probable states of a local level by dense algebra, and their covariance."""
+    K = model.epochs
+    # Each state is the start and all steps up to it.
+    sums = np.tril(np.ones((K, K)))
+    steps = np.full(K, model.noise["w"] ** 2)
+    steps[0] += model.spread["x"] ** 2
+    P = sums @ np.diag(steps) @ sums.T
+    at = np.flatnonzero(np.isfinite(z))
+    S = P[np.ix_(at, at)] + model.deviation["z"] ** 2 * np.eye(len(at))
+    gain = P[:, at] @ np.linalg.inv(S)
+    return gain @ z[at], P - gain @ P[at]
+
+
+@pytest.mark.parametrize("tracker", [LevenbergMarquardtSmoother(), AutoTracker()])
+def test_a_path_leaves_out_what_is_too_far_from_all_other_readings(tracker):
+    """Each reading is judged by the path of all others that are taken, with it left out by hand."""
+    z = LEVEL.draw(0, 20, 4).z.copy()
+    rng = np.random.default_rng(1)
+    z += np.where(rng.random(z.shape) < 0.08, rng.choice([-8.0, 8.0], z.shape), 0.0)
+    tracks = tracker.gated(0.99).track(LEVEL, z)
+    most = chi2.ppf(0.99, 1)
+    for trial, out in enumerate(tracks.gated[..., 0]):
+        taken = np.where(out, np.nan, z[trial, :, 0])
+        x, P = own_solution(LEVEL, taken)
+        np.testing.assert_allclose(tracks.mean[trial, :, 0], x, atol=1e-9)
+        np.testing.assert_allclose(tracks.covariance[trial, :, 0, 0], np.diag(P), rtol=1e-9)
+        for k in range(LEVEL.epochs):
+            others = taken.copy()
+            others[k] = np.nan
+            x, P = own_solution(LEVEL, others)
+            assert out[k] == ((z[trial, k, 0] - x[k]) ** 2 > most * (P[k, k] + 1.0))
+    assert tracks.gated.any(axis=(1, 2)).sum() > 10
+
+
+def test_a_grid_leaves_out_what_the_filter_of_a_linear_model_leaves_out():
+    z = spiked(LEVEL)
+    exact = Grid(300).gated(GATE).track(LEVEL, z)
+    tracks = Filter(gate=GATE).track(LEVEL, z)
+    np.testing.assert_array_equal(exact.gated, tracks.gated)
+    np.testing.assert_allclose(exact.mean, tracks.mean, atol=1e-4)
+    np.testing.assert_array_equal(Bootstrap().gated(GATE).track(LEVEL, z).gated, tracks.gated)
+
+
+def test_two_probable_states_are_no_reason_to_leave_a_reading_out():
+    """The mean of both roots of a square is 0, from which every reading is far away."""
+    square = replace(LEVEL, next={"x": "0.9*x + w"}, readings={"z": "x**2"}, deviation={"z": 0.3})
+    square = replace(square, spread={"x": 1.0})
+    z = square.draw(0, 3, 1).z.copy()
+    z[0, 10] += 20
+    for tracker in (AutoTracker(), Grid(200), Bootstrap()):
+        gated = tracker.gated(GATE).track(square, z).gated
+        assert np.argwhere(gated).tolist() == [[0, 10, 0]]
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
         (
-            ["tracker=[auto]", "gate=0.99"],
-            "gate=0.99: trackers.auto takes no gate; choose a filter",
+            ["tracker=[ipe_newton]", "gate=0.99"],
+            "gate=0.99: trackers.ipe_newton takes no gate; choose a filter or a smoother",
         ),
         (["tracker=[ekf]", "gate=0.99", "find=[w]"], "find: the likelihood of trackers.ekf jumps"),
         (["tracker=[ekf]", "gate=0"], "gate=0.0: give a number above 0 and up to 1"),

@@ -49,8 +49,8 @@ _OF_PARTICLES = (
     " 2."
 )
 _OF_GATES = (
-    "A reading whose own innovation lies beyond the gate counts as missing; NIS is divided by its"
-    " mean within the gate."
+    "A reading whose own innovation, or distance from the path of all others (lm_ieks, auto), lies"
+    " beyond the gate counts as missing; NIS is divided by its mean within the gate."
 )
 _OF_CONSTANTS = (
     f"Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
