@@ -505,8 +505,8 @@ STATISTICS: tuple[Statistic, ...] = (
         " Overconfident, too cautious: it lies above or below 1, below also with a NEES of"
         f" {intervals.UNSEEN_NEES:g} n in the number of trials that may be unusual and unseen;"
         f" consistent: it includes 1 and ends at {intervals.EXCLUDED:g} at most; not refuted: it"
-        " includes 1; undecided: a few trials carry the mean, or it seems to lie below 1 and rare"
-        f" large errors may be missing. None for fewer than {FEW} trials.",
+        f" includes 1 and ends at {intervals.VAGUE:g} at most; undecided: it ends beyond, or seems"
+        f" to lie below 1 and rare large errors may be missing. None for fewer than {FEW} trials.",
         lambda s: f.claimed(s).verdict,
         kind="word",
         where=("calibration",),

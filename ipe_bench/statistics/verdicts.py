@@ -76,8 +76,8 @@ VERDICTS = (
         UNDECIDED,
         "undecided",
         "?",
-        "A few trials dominate the mean NEES, or it seems too small and rare large errors may be"
-        " missing.",
+        "These trials do not exclude that the true variance is 10 times the reported one, or the"
+        " mean NEES seems too small and rare large errors may be missing.",
     ),
     Word(
         WRONG,

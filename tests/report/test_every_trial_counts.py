@@ -41,8 +41,14 @@ from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.report.tables.table import Table, latex, markdown
 from ipe_bench.report.tables.terminal import summary_tables
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.intervals import EXCLUDED
-from ipe_bench.statistics.verdicts import CONSISTENT, NO_VERDICT, NOT_REFUTED, OVERCONFIDENT
+from ipe_bench.statistics.intervals import EXCLUDED, VAGUE
+from ipe_bench.statistics.verdicts import (
+    CONSISTENT,
+    NO_VERDICT,
+    NOT_REFUTED,
+    OVERCONFIDENT,
+    UNDECIDED,
+)
 from ipe_bench.trials.thresholds import FEW
 
 LESS_IS_BETTER = ("error", "rmse", "bias", "std", "q95", "q90", "median")
@@ -170,8 +176,10 @@ def torn_verdicts(analysis: Analysis) -> Iterator[str]:
             yield "overconfident is not read from the interval"
         if (word == CONSISTENT) != (low <= 1 <= high <= EXCLUDED):
             yield "consistent is not read from the interval"
-        if word == NOT_REFUTED and not (low <= 1 and high > EXCLUDED):
+        if (word == NOT_REFUTED) != (low <= 1 and EXCLUDED < high <= VAGUE):
             yield "not refuted is not read from the interval"
+        if high > VAGUE and word not in (OVERCONFIDENT, UNDECIDED):
+            yield "undecided is not read from the interval"
         if (word == NO_VERDICT) != (row["claims"] < FEW):
             yield "a verdict of few"
         if not (np.isnan(low) or low <= row["nees_mean"] * (1 + 1e-9)):

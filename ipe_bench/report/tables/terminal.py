@@ -261,7 +261,7 @@ def _success(row: Mapping[str, Any]) -> str:
 def _verdict(row: Mapping[str, Any]) -> str:
     """Words a verdict, with the largest factor of the variance that is not excluded."""
     verdict = row["verdict"]
-    if verdict not in (CONSISTENT, NOT_REFUTED) or math.isnan(row["nees_mean_high"]):
+    if verdict not in (CONSISTENT, NOT_REFUTED):
         return shown(verdict)
     return f"{shown(verdict)}, within {factor(row['nees_mean_high'])}"
 
