@@ -41,7 +41,7 @@ def estimate_command(arguments: Sequence[str]) -> int:
     provenance = _provenance(asked, question.found.files, parts)
     drawn = asked.spec.figures != "none"
     with asked.folder(NAME, command, FILES) as folder:
-        answer = Answer.to(question, asked.measurement, "lines")
+        answer = Answer.to(question, asked.title, "lines")
         stored = store(folder, answer, command, provenance)
     show(answer.parts())  # before what takes longest, so that who stops there has the numbers
     say_files([stored, *write_page(folder, answer, provenance, figures=drawn)])

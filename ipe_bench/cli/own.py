@@ -55,8 +55,8 @@ def own_command(short: Short) -> int:
     from ipe_bench.questions.own.answer import own_parts, takes_one, write_own
 
     with folder as place:
-        files = write_own(place, asked.measurement, found)
-    show(own_parts(asked.measurement, found))
+        files = write_own(place, asked.title, found)
+    show(own_parts(asked.title, found))
     say_files(files)
     return 0 if takes_one(found) else 1
 

@@ -96,9 +96,7 @@ def _asked(name: str, arguments: Sequence[str], row: Row, files: Sequence[str]) 
         if found.words.standard_baselines:
             spec = spec.suited()
     about_estimate = bool(files) and row.at_estimate
-    return Asked(
-        found.measurement, spec.scenario, spec.estimators, trials, found.folder, about_estimate
-    )
+    return Asked(found.title, spec.scenario, spec.estimators, trials, found.folder, about_estimate)
 
 
 def _shown(found: Answered) -> int:

@@ -201,7 +201,7 @@ def _left_out(jobs: Sequence[Spec]) -> list[str]:
         return []
     models = ", ".join(dict.fromkeys(job.measurement.name for job in lacking))
     left = [one for one in standard if any(one not in job.estimators for job in lacking)]
-    return [f"{' and '.join(left)} are left out for {models}: filters need epochs and a prior"]
+    return [f"{' and '.join(left)} are left out for {models}: filters need an order and a prior"]
 
 
 def _flags(arguments: Sequence[str]) -> Namespace:

@@ -36,6 +36,8 @@ _FORMULA = re.compile(r"[-+*/^()<>]|\bif\b")
 """A sign that a word without a key is a formula, rather than a name."""
 _BARE = re.compile(r"[^\w.:/,=-]")
 """What a shell may read as its own."""
+_BARE_TITLE = re.compile(r"[A-Za-z][\w-]*")
+"""A file's name that is a word of a command as it stands."""
 _FLAG = re.compile("--?[a-z][a-z-]*")
 _VALUED = re.compile(
     "-(cd|cn|c|p|i)|--(config-dir|config-name|experimental-rerun|cfg|package|info)"
@@ -499,12 +501,13 @@ class _Reader:
         files = ", ".join(self.files)
         if "next" in keys:
             words = ["state_model=formulas", f"state_model.file={file}"]
+            words += _title("state_model", file, content)
             from ipe_bench.states.formulas import Formulas
 
             states = content["next"] if isinstance(content["next"], dict) else {}
             self._require_complete(file, content, "state_model", Formulas)
             model = f"Model: states {enumerate_few(list(states))} of {file}, which move."
-            log = f"Log: {files}, a row per epoch"
+            log = f"Log: {files}, a row per time step"
             if self._is_timed(content):
                 words += ["state_model.inputs.time=0"]
                 log += "; its column time has the times, and dt is the step"
@@ -514,6 +517,7 @@ class _Reader:
 
             self._require_complete(file, content, "measurement", Ode)
             words = ["measurement=ode", f"measurement.file={file}"]
+            words += _title("measurement", file, content)
             model = f"Model: differential equations of {file}."
             return self._short(words, [model, f"Readings: {files}.", self._noise()])
         there = f"its keys are {', '.join(map(str, keys))}" if keys else "it has no keys"
@@ -576,6 +580,14 @@ def _names(content: dict[str, Any]) -> list[str]:
     formulas = [*content.get("next", {}).values(), *content.get("readings", {}).values()]
     names = [name for text in formulas for name in parse(str(text), "formula").names]
     return list(dict.fromkeys(names))
+
+
+def _title(group: str, file: str, content: dict[str, Any]) -> list[str]:
+    """Returns the word that names a model after its file, unless the file names it."""
+    stem = Path(file).stem
+    if "title" in content or not _BARE_TITLE.fullmatch(stem):
+        return []
+    return [f"{group}.title={stem}"]
 
 
 def _is_short(name: str, column: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -15,11 +16,17 @@ from ipe_bench.cli.session import composed, jobs_of, session
 from ipe_bench.cli.spec import Spec
 from ipe_bench.cli.words import Words
 from ipe_bench.measurements import Nist
+from ipe_bench.measurements.function import title_of
 from ipe_bench.report.page.writer import reserved_folder
 from ipe_bench.runs.provenance import describe
 
 if TYPE_CHECKING:
     from ipe_bench.real.logs import LogQuestion
+
+_OWN = ("function", "formula", "formulas", "ode")
+"""Options that are models of the user's own."""
+_FOLDER = re.compile(r"[\w-]+")
+"""A title that can be part of the name of a folder."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,13 @@ class Single:
         if isinstance(model, Nist):
             return f"nist/{model.dataset.lower()}"
         return self.words.chosen(group) or model.name
+
+    @property
+    def title(self) -> str:
+        """Measurement model of the request, or the name that the user gave to an own one."""
+        if self.spec.state_model is not None:
+            return self.spec.state_model.name if self.measurement in _OWN else self.measurement
+        return title_of(self.spec.measurement) if self.measurement in _OWN else self.measurement
 
     @property
     def estimators(self) -> dict[str, Any]:
@@ -71,7 +85,8 @@ class Single:
         folder = Path(self.spec.output)
         named = not {"name", "output"}.isdisjoint(self.words.keys)
         if not named:
-            folder = folder.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
+            model = self.title if _FOLDER.fullmatch(self.title) else self.measurement
+            folder = folder.with_name(f"{self.command}-{model.replace('/', '-')}")
         return reserved_folder(folder, name, identity, elsewhere=not named, files=files)
 
 

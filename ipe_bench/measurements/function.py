@@ -21,13 +21,16 @@ from ipe_bench.basics.errors import UserError, place_of, refuse_unknown, unknown
 from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.options import Finite, Positive
 from ipe_bench.functions.judged import Judged, judged
-from ipe_bench.measurements.formula import WrittenModel
+from ipe_bench.measurements.base import Forwarding, Measurement
+from ipe_bench.measurements.formula import Formula, WrittenModel
 
 _CHUNK = 8
 """Trials per call of a compiled JAX program; shorter batches are padded, so that bits do not depend
 on them."""
 _TIMES = ("t", "time")
 """Columns that are taken for the time of the readings."""
+_LONGEST_TITLE = 40
+"""Letters of a formula that is a title."""
 
 
 @dataclass(frozen=True)
@@ -319,6 +322,18 @@ def function(
             " another"
         )
     return Function(of=f"{module}:{name}", start=start or {}, **options)
+
+
+def title_of(model: Measurement) -> str:
+    """Names a model in titles: a function by its own name, a short formula by itself."""
+    whole = model
+    while isinstance(whole, Forwarding):
+        whole = whole.whole
+    if isinstance(whole, Function):
+        return whole.of.rpartition(":")[2]
+    if isinstance(whole, Formula) and len(whole.expression) <= _LONGEST_TITLE:
+        return whole.expression
+    return model.name
 
 
 @cache

@@ -25,8 +25,8 @@ NAMES = tuple[str, ...]
 class Asked:
     """Holds a scenario that a question is about."""
 
-    measurement: str
-    """Name of the model, as it was chosen."""
+    title: str
+    """Name of the model, as its user calls it."""
     scenario: Scenario
     estimators: Mapping[str, Estimator]
     trials: int | None

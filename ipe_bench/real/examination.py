@@ -221,13 +221,25 @@ class Examination:
         """Places values of the readings that are present among all (m,)."""
         return at_rows(self.rows, values, self.whole.R.m)
 
-    @cached_property
+    @property
     def shift(self) -> Array:
-        """The move (m,) without a reading of the parameter that moves most, in standard errors.
+        """The move (m,) without a reading of the parameter that moves most, in standard errors; NaN
+        if the reading is missing."""
+        return self._at_rows(self._moves.max(axis=0))
+
+    @property
+    def moved(self) -> Array:
+        """The place (m,) of the parameter that moves most without a reading; NaN if it is
+        missing."""
+        return self._at_rows(self._moves.argmax(axis=0).astype(float))
+
+    @cached_property
+    def _moves(self) -> Array:
+        """Moves (n, k) of the parameters without one of the k readings that are there, in standard
+        errors.
 
         By the linear model about the estimate, without reading i that is P J_i' e_i, e_i being its
-        estimated error (Cook and Weisberg, Residuals and Influence in Regression, 1982); NaN if it
-        is missing.
+        estimated error (Cook and Weisberg, Residuals and Influence in Regression, 1982).
         """
         R = self.problem.R
         n = self._J.shape[1]
@@ -240,7 +252,7 @@ class Examination:
         with np.errstate(all="ignore"):
             moved = P @ slopes.T * (statistic / variance)
             in_errors = np.abs(moved / deviations(P)[:, None])
-        return self._at_rows(in_errors.max(axis=0))
+        return in_errors
 
     @cached_property
     def bootstrap(self) -> BootstrapIntervals:

@@ -417,7 +417,7 @@ class LogTracks:
         it says, from where the track is lost, or what is wrong with the constants that were
         found."""
         if self.lost_from is not None:
-            return f"{LOST} from epoch {self.lost_from}"
+            return f"{LOST} from time step {self.lost_from}"
         if self.effective < _COLLAPSED:
             return COLLAPSED
         if self.found:
@@ -450,7 +450,7 @@ def _second(log: Log, tracks: Tracks) -> list[str]:
         share += ", likelier than this one"
     return [
         f"AMBIGUOUS: a second path is right with a probability of {share}; in it"
-        f" {state.name} differs by {distance} at epoch {k + 1}, which the deviations count"
+        f" {state.name} differs by {distance} at time step {k + 1}, which the deviations count"
     ]
 
 
@@ -506,8 +506,8 @@ def _left_out(log: Log, gated: Mask | None) -> list[str]:
     further = len(listed) - _MOST_GATED_SHOWN
     others = f" and {further} more" if further > 0 else ""
     return [
-        f"left out, as beyond the gate: {len(at)} of {np.isfinite(log.z).sum()} readings, at epochs"
-        f" {', '.join(listed[:_MOST_GATED_SHOWN])}{others}"
+        f"left out, as beyond the gate: {len(at)} of {np.isfinite(log.z).sum()} readings, at time"
+        f" steps {', '.join(listed[:_MOST_GATED_SHOWN])}{others}"
     ]
 
 
@@ -524,7 +524,7 @@ def _worst(log: Log, nis: Array, degrees: Array, lost_from: int | None) -> list[
     others = f" and {further} more" if further else ""
     return [
         f"outliers, whose readings are further from their predictions than chance explains:"
-        f" epochs {epochs}{others}; empty a cell to leave its reading out"
+        f" time steps {epochs}{others}; empty a cell to leave its reading out"
     ]
 
 

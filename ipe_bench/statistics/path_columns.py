@@ -1,4 +1,4 @@
-"""Statistics of tracks: errors over all epochs, and how they and NEES run from epoch to epoch.
+"""Statistics of tracks: errors over all time steps, and how they and NEES run from epoch to epoch.
 
 Epochs are dependent, so intervals and verdicts are those over trials.
 """
@@ -32,7 +32,8 @@ _TOLERATED = 0.01
 
 @dataclass(frozen=True, eq=False)
 class PathSample(Sample):
-    """Replaces errors and bounds of the same trials by their root mean square over all epochs."""
+    """Replaces errors and bounds of the same trials by their root mean square over the whole
+    path."""
 
     @cached_property
     def linear_bound(self) -> Array:
@@ -50,8 +51,8 @@ def path(s: Sample) -> PathSample:
 
 
 def of_path(formula: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
-    """Turns a formula (n,) of errors over all epochs into its shown form (n + 1,); NaN if no state
-    is tracked."""
+    """Turns a formula (n,) of errors over all time steps into its shown form (n + 1,); NaN if no
+    state is tracked."""
 
     def shown(s: Sample) -> Array:
         if not is_track(s):
@@ -67,8 +68,8 @@ bound = of_path(lambda s: s.linear_bound)
 
 
 def error_quantile(s: Sample, q: float) -> Array:
-    """Computes a quantile over all trials of the root mean square error over all epochs, of each
-    state, and of all states over the filter that is linearised at the true path (n + 1,)."""
+    """Computes a quantile over all trials of the root mean square error over all time steps, of
+    each state, and of all states over the filter that is linearised at the true path (n + 1,)."""
     if "path_error" not in s.scalars:
         return np.full(s.n + 1, np.nan)
     each = [quantile(e, q) for e in path(s).error.T]
@@ -222,19 +223,19 @@ def _error_statistic(name: str, title: str, told: str, q: float) -> Statistic:
 STATISTICS: tuple[Statistic, ...] = (
     _error_statistic(
         "median",
-        "median error, all epochs",
-        "Median of a trial's root mean square error over all epochs. Of all states together, over"
-        " the filter that is linearised at the true path, for smoothers too, so that all trackers"
-        " are compared. A track that is not finite counts as infinite.",
+        "median error, all time steps",
+        "Median of a trial's root mean square error over all time steps. Of all states together,"
+        " over the filter that is linearised at the true path, for smoothers too, so that all"
+        " trackers are compared. A track that is not finite counts as infinite.",
         0.5,
     ),
-    _error_statistic("q95", "95 % error, all epochs", "95 % quantile of these errors.", 0.95),
+    _error_statistic("q95", "95 % error, all time steps", "95 % quantile of these errors.", 0.95),
     Statistic(
         "path_rmse_solved",
         "rmse, solved",
         "solved trials of trackers",
-        "Root mean square error over all epochs; over all states, root mean square of its ratio to"
-        " the bound at the truth. Interval: as for rmse, over trials.",
+        "Root mean square error over all time steps; over all states, root mean square of its ratio"
+        " to the bound at the truth. Interval: as for rmse, over trials.",
         rmse,
         limits=rmse_limits,
         given="solved",
@@ -248,7 +249,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "all trials of trackers",
         "Standard deviation of the extended Kalman filter that is linearised at the true path"
         " (Taylor, IEEE TAC 24, 1979), or of the smoother behind it if the tracker smooths, root"
-        " mean square over all epochs.",
+        " mean square over all time steps.",
         bound,
         kind="physical",
         where=("tracks",),
@@ -257,8 +258,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "path_success",
         "path held",
         "all trials of trackers",
-        "Share of trials whose mean squared error over all epochs, each state in multiples of this"
-        " bound, lies in the gate of a success. Interval: Clopper and Pearson.",
+        "Share of trials whose mean squared error over all time steps, each state in multiples of"
+        " this bound, lies in the gate of a success. Interval: Clopper and Pearson.",
         lambda s: path_success(s)[0],
         limits=lambda s: path_success(s)[1:],
         kind="share",
@@ -266,9 +267,9 @@ STATISTICS: tuple[Statistic, ...] = (
     ),
     Statistic(
         "path_nees_solved",
-        "mean NEES / n, all epochs",
+        "mean NEES / n, all time steps",
         "solved trials of trackers",
-        "Mean over trials and all epochs of e' P⁻¹ e / n with the covariance P that the tracker"
+        "Mean over trials and all time steps of e' P⁻¹ e / n with the covariance P that the tracker"
         " reports: 1 where it is right; none where P is singular by the model.",
         lambda s: mean_score(s, "path_nees") / s.n,
         given="solved",
@@ -276,10 +277,10 @@ STATISTICS: tuple[Statistic, ...] = (
     ),
     Statistic(
         "path_verdict",
-        "verdict, all epochs",
+        "verdict, all time steps",
         "converged trials of trackers",
-        "The verdict on each trial's mean NEES over all epochs: epochs are dependent, trials are"
-        " not.",
+        "The verdict on each trial's mean NEES over all time steps: time steps are dependent,"
+        " trials are not.",
         path_verdict,
         kind="word",
         where=("tracks",),
@@ -310,8 +311,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "converged trials of filters of states",
         "Share of trials whose normalised innovations are autocorrelated at the level"
         f" {NOT_WHITE:g}, by Ljung and Box's test (Biometrika 65, 1978) pooled over readings, lags"
-        f" 1 to 10 at most and to a fifth of the epochs: {NOT_WHITE:g} where the filter is right."
-        " Interval: Clopper and Pearson.",
+        f" 1 to 10 at most and to a fifth of the time steps: {NOT_WHITE:g} where the filter is"
+        " right. Interval: Clopper and Pearson.",
         lambda s: not_white(s)[0],
         limits=lambda s: not_white(s)[1:],
         kind="share",
@@ -327,10 +328,10 @@ STATISTICS: tuple[Statistic, ...] = (
     ),
     Statistic(
         "first_bad_epoch",
-        "first bad epoch",
+        "first bad time step",
         "solved trials of trackers that have one",
-        f"Mean number of the first epoch whose error lies where a share of {GATE:g} should by the"
-        " bound at the truth.",
+        f"Mean number of the first time step whose error lies where a share of {GATE:g} should by"
+        " the bound at the truth.",
         lambda s: mean_score(s, "first_bad_epoch"),
         where=("tracks",),
     ),

@@ -237,8 +237,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "given",
         "no trials: the same for all",
         "What the estimator was given: of constants, all readings (readings) and also the prior of"
-        " the truth (prior); of states that move, for the state at an epoch, the readings up to it"
-        " (so far) or of the whole path (all readings).",
+        " the truth (prior); of states that move, for the state at a time step, the readings up to"
+        " it (so far) or of the whole path (all readings).",
         lambda s: given_of(s.group.footer),
         kind="word",
     ),
@@ -592,7 +592,7 @@ STATISTICS: tuple[Statistic, ...] = (
     _all(
         "iterations_median",
         "iterations",
-        "Median; none for filters, whose epochs are not iterations.",
+        "Median; none for filters, whose time steps are not iterations.",
         lambda s: quantile(s.scalars["iterations"], 0.5) if s.iterates else np.nan,
         where=("costs",),
     ),

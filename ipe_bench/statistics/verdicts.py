@@ -97,7 +97,7 @@ VERDICTS = (
         LOST,
         "lost",
         "!",
-        "From the named epoch of a log on, most innovations are larger than all but one in a"
+        "From the named time step of a log on, most innovations are larger than all but one in a"
         " million by chance.",
     ),
     Word(

@@ -11,6 +11,8 @@ import pytest
 from scipy.optimize import curve_fit
 
 import ipe_bench as ib
+from ipe_bench.cli import shorts
+from ipe_bench.cli.single import single
 from ipe_bench.measurements import Nist
 from ipe_bench.real.estimation import Question
 from ipe_bench.real.readings import write_readings
@@ -310,3 +312,29 @@ def test_noise_that_is_overstated_is_said_and_rounded_intervals_hold_the_estimat
     assert (
         "c -1.92 … 2.53 −∞ … ∞ -10.52 … 1.61" in less
     )  # to tens, as the width is, the upper end would be 0
+
+
+@pytest.mark.parametrize(
+    ("words", "title", "folder"),
+    [
+        (["oxygen.py", "oxygen.csv"], "demand", "estimate-demand"),
+        (["b1*(1-exp(-b2*t))", "oxygen.csv"], "b1*(1-exp(-b2*t))", "estimate-formula"),
+        (["car.yaml", "log.csv"], "car", "estimate-car"),
+    ],
+)
+def test_an_answer_has_the_name_that_its_user_gave_to_the_model(
+    words, title, folder, tmp_path, monkeypatch
+):
+    function = "import numpy as np\ndef demand(t, b1=20.0, b2=0.5):\n"
+    (tmp_path / "oxygen.py").write_text(f"{function}    return b1 * (1 - np.exp(-b2 * t))\n")
+    readings = zip((1, 2, 3, 4, 5, 7), (8.3, 10.3, 19.0, 16.0, 15.6, 19.8), strict=True)
+    rows = [f"{day},{reading}" for day, reading in readings]
+    (tmp_path / "oxygen.csv").write_text("\n".join(["t,reading", *rows]))
+    yaml = "next: {x: x + w}\nreadings: {gps: x}\nnoise: {w: 0.1}\ndeviation: {gps: 1}\n"
+    (tmp_path / "car.yaml").write_text(f"{yaml}spread: {{x: 1}}\n")
+    (tmp_path / "log.csv").write_text("gps\n" + "\n".join(map(str, [0.3, -0.2, 1.1, 0.4])) + "\n")
+    monkeypatch.chdir(tmp_path)
+    asked = single("estimate", shorts.read("estimate", words).in_full)
+    assert asked.title == title
+    with asked.folder("estimate", {}) as place:
+        assert place.as_posix() == f"outputs/{folder}"

@@ -107,7 +107,8 @@ def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: s
         ),
         (
             ["car.yaml", "readings=log.csv"],
-            "state_model=formulas state_model.file=car.yaml readings='log.csv'",
+            "state_model=formulas state_model.file=car.yaml state_model.title=car"
+            " readings='log.csv'",
         ),
         *(
             (

@@ -68,7 +68,7 @@ def test_a_prior_is_told_to_filters_and_is_no_part_of_the_truth() -> None:
     )
     rows = frame(found)
     told = rows[rows["estimator"] == "map_lm"]
-    assert told["told"].tolist() == ["start ± 100 %", "start ± 1000 %"]
+    assert told["prior"].tolist() == ["start ± 100 %", "start ± 1000 %"]
     assert not told["ranked"].any()
     assert told["finds"].iloc[1] == 1.0
     stated = own(line(error_scale=5.0), both, 50)

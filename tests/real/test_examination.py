@@ -167,8 +167,9 @@ def test_the_reading_that_carries_the_answer_is_named(noise):
         rest = np.delete(np.arange(5), i)
         weights = np.linalg.inv(R[np.ix_(rest, rest)])
         without = np.linalg.solve(X[rest].T @ weights @ X[rest], X[rest].T @ weights @ z[rest])
-        moved = np.abs((without - found.x) / found.standard_errors).max()
-        assert_agrees(found.shift[i], moved, rtol=1e-6)
+        moves = np.abs((without - found.x) / found.standard_errors)
+        assert_agrees(found.shift[i], moves.max(), rtol=1e-6)
+        assert found.moved[i] == np.argmax(moves)
 
 
 @pytest.mark.oracle(

@@ -350,7 +350,7 @@ def test_nis_above_its_limit_are_in_red_and_their_share_is_said(walked):
     assert line.get_ydata() == pytest.approx(limit)
     assert "(5 % if right)" in drawing.caption
     share = 100 * (nis > limit).sum() / 59
-    assert f"at {share:.1f} % of 59 epochs" in drawing.caption
+    assert f"at {share:.1f} % of 59 time steps" in drawing.caption
     assert len(drawing.caption.split()) <= 30
 
 

@@ -572,7 +572,7 @@ def test_the_bounds_of_the_first_hour_are_those_of_its_commands(hour):
     for command, bounds in zip(designs, printed, strict=True):
         given = dict(word.split("=", 1) for word in command[1:] if "=" in word)
         here = "oxygen.csv" in command  # the short form is at the estimate of these readings
-        assert here != (given.get("at") == "outputs/estimate-function")
+        assert here != (given.get("at") == "outputs/estimate-demand")
         days = today if here else json.loads(given["measurement.columns.t"])
         found = ipe_bench.design(oxygen(days, float(given["noise.deviation"])), at=estimate)
         sizes = [one.size for one in found.observability.parameters]
@@ -597,7 +597,7 @@ def test_the_estimates_of_the_first_hour_come_out_with_a_profile_that_allows_no_
 )
 def test_the_commands_of_the_first_hour_are_composed(command, hour):
     """What they ask for is understood; the slow test of all pages runs them."""
-    own = ("-m", "at=outputs/estimate-function")
+    own = ("-m", "at=outputs/estimate-demand")
     short = shorts.read(command[0], [word for word in command[1:] if word not in own])
     given = words.read(command[0], short.in_full)
     with session():

@@ -428,7 +428,7 @@ def test_states_that_move_have_words_of_their_own(tmp_path):
     assert path["kf"] > 1.25 * path["rts"]
     page = write_report([tmp_path], tmp_path / "out").report.read_text(encoding="utf-8")
     body = page.partition("</main>")[0].partition('id="definitions"')[0]
-    assert "2 moving states are estimated from 30 readings at 30 epochs: " in page
+    assert "2 moving states are estimated from 30 readings at 30 time steps: " in page
     shown = re.sub(r"base64,[^\"]*", "", body)
     for words in (
         "1 is the best",

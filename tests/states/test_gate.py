@@ -152,7 +152,7 @@ def test_a_log_names_what_is_left_out_and_fits():
     assert not plain.passes
     assert (one.passes, one.verdict) == (True, "consistent")
     (note,) = one.notes
-    assert note == "left out, as beyond the gate: 2 of 40 readings, at epochs 11, 26"
+    assert note == "left out, as beyond the gate: 2 of 40 readings, at time steps 11, 26"
     answer = ib.estimate(LEVEL, z, {"ekf": Filter(gate=GATE)})
     assert "5 % of the readings, beyond the gate of ekf" in str(_facts(answer)[-1])
     table = answer.table()
@@ -184,7 +184,7 @@ def test_a_filter_that_takes_no_reading_any_more_is_lost():
     z = LEVEL.draw(0, 1, 1).z[0].copy()
     z[34:] += 500
     (one,) = ib.estimate(LEVEL, z, {"ekf": Filter(gate=GATE)})
-    assert (one.verdict, one.passes) == ("lost from epoch 35", False)
+    assert (one.verdict, one.passes) == ("lost from time step 35", False)
 
 
 def test_a_filter_is_lost_though_most_epochs_have_no_reading():
@@ -194,7 +194,7 @@ def test_a_filter_is_lost_though_most_epochs_have_no_reading():
     z[180:] += 500
     (one,) = ib.estimate(sparse, z, {"ekf": Filter(gate=GATE)})
     assert one.share_gated == 4 / 40
-    assert (one.verdict, one.passes) == ("lost from epoch 185", False)
+    assert (one.verdict, one.passes) == ("lost from time step 185", False)
 
 
 def test_an_outlier_at_the_end_of_a_log_is_no_lost_track():

@@ -153,7 +153,7 @@ def test_particles_that_lose_a_log_are_named():
     )  # whose particles do not spread far enough to follow
     z = np.r_[np.zeros(30), np.linspace(1.0, 30.0, 20)][:, None]
     one = ib.estimate(steered, z, {"few": Bootstrap(200)})["few"]
-    assert (one.verdict, one.passes, one.lost_from) == ("lost from epoch 31", False, 31)
+    assert (one.verdict, one.passes, one.lost_from) == ("lost from time step 31", False, 31)
 
 
 FOLLOWED = replace(DRIVEN, next={"x": "x + w"}, inputs={}, count=200)
@@ -527,7 +527,7 @@ def test_the_worst_epochs_of_a_log_are_named():
     filtered, _ = ib.estimate(model, z, trackers)
     (said,) = filtered.notes
     assert said.startswith("outliers, whose readings are further")
-    assert f"epochs 31 (NIS {filtered.nis[30]:.3g}), 30 (NIS {filtered.nis[29]:.3g});" in said
+    assert f"time steps 31 (NIS {filtered.nis[30]:.3g}), 30 (NIS {filtered.nis[29]:.3g});" in said
 
 
 def test_each_of_several_logs_has_its_track_and_page(ipe_bench, tmp_path):
@@ -547,7 +547,8 @@ def test_each_of_several_logs_has_its_track_and_page(ipe_bench, tmp_path):
     (_, alone, _) = ipe_bench(
         "estimate", "state_model=formulas", *given, *words[:1], "readings=b.csv"
     )
-    assert alone.split("last epoch")[1].split()[4:8] == out.split("last epoch")[2].split()[4:8]
+    states = [part.split()[4:8] for part in out.split("last time step")]
+    assert alone.split("last time step")[1].split()[4:8] == states[2]
 
 
 def test_status_says_what_a_folder_of_an_estimate_has(ipe_bench, tmp_path):

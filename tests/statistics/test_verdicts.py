@@ -33,7 +33,7 @@ def test_the_table_has_every_word_once_and_keeps_others():
     assert [word.value for word in VERDICTS[:7]] == list(get_args(Verdict))
     names = [word.value for word in VERDICTS]
     assert len(names) == len(set(names))
-    assert shown("lost from epoch 31") == "lost from epoch 31"
+    assert shown("lost from time step 31") == "lost from time step 31"
 
 
 def test_every_row_says_its_verdict_on_any_screen(synthetic):

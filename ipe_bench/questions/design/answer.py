@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from ipe_bench.measurements.function import title_of
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.plugins.extensions import richer_models
 from ipe_bench.questions.design.maths import Design, Further, Way, design, entry_in_words
@@ -49,7 +50,7 @@ class DesignAnswer(Shown, Design):
     """Shows a design."""
 
     def parts(self) -> Iterator[Part]:
-        return design_parts(self.scenario.measurement.name, self)
+        return design_parts(title_of(self.scenario.measurement), self)
 
 
 def _best(design: Design) -> Way | None:

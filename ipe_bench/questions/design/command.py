@@ -55,9 +55,9 @@ def answer(asked: Asked, at: str | None = None, **given: Any) -> Answered:
     with asked.folder("design", identity, (READINGS,)) as folder:
         found = designed(scenario, errors=errors, at=point, **given)
         found = dataclasses.replace(found, about_estimate=asked.about_estimate)
-        files = write_design(folder, asked.measurement, found)
+        files = write_design(folder, asked.title, found)
     code = 0 if found.observability.observable else 1
-    return Answered(design_parts(asked.measurement, found), code, files=files)
+    return Answered(design_parts(asked.title, found), code, files=files)
 
 
 def _estimates(folder: str) -> dict[str, float]:

@@ -155,7 +155,7 @@ def sentences(own: Own) -> Iterator[str]:
     yield from _cheaper(own, worst)
     told = list(_told_a_prior(own, worst))
     if told:
-        yield f"Not ranked, because they use a prior that you did not state: {'; '.join(told)}."
+        yield f"Not ranked, because they need a prior, which you did not state: {'; '.join(told)}."
     for why in dict.fromkeys(own.left_out.values()):
         labels = [label for label, reason in own.left_out.items() if reason == why]
         yield f"Left out, because each {why}: {', '.join(labels)}."
@@ -169,7 +169,7 @@ def _told_a_prior(own: Own, point: Point) -> Iterator[str]:
         claims = [one for one in unranked if one.told == told]
         labels = ", ".join(one.label for one in claims)
         verb = "finds" if len(claims) == 1 else "find"
-        yield f"told {told}, {_missing(own, claims) or f'{labels} {verb} the best fit'}"
+        yield f"with the prior {told}, {_missing(own, claims) or f'{labels} {verb} the best fit'}"
 
 
 def _cheaper(own: Own, point: Point) -> Iterator[str]:
@@ -203,7 +203,7 @@ def _table(name: str, own: Own, point: Point, number: int) -> Table:
     where = f"logs that begin at {values}" if own.moving else f"truth {values}, noise {own.noise}"
     columns = [
         words("estimator", [one.label for one in claims]),
-        words("told", [one.told for one in claims]),
+        words("prior", [one.told for one in claims]),
         texts("keeps track, %" if own.moving else "finds, %", _shares(claims, "finds")),
         texts("truth in 95 % bars, %", _shares(claims, "holds")),
         words("worst", [one.worst for one in claims]),
@@ -247,7 +247,7 @@ def frame(own: Own) -> pd.DataFrame:
                 {
                     "truth": number,
                     "estimator": one.label,
-                    "told": one.told,
+                    "prior": one.told,
                     "ranked": one in ranked(own, point),
                     "trials": one.trials,
                     "finds": one.finds,

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from ipe_bench.basics.statuses import Status
+from ipe_bench.measurements.function import title_of
 from ipe_bench.questions.posterior.maths import (
     Divergence,
     Posterior,
@@ -59,7 +60,7 @@ class PosteriorAnswer(Shown, list[Reference]):
     def __init__(self, scenario: Scenario, found: Sequence[Reference]) -> None:
         super().__init__(found)
         self.name = (
-            f"{scenario.measurement.name}, {scenario.noise.name}, error scale"
+            f"{title_of(scenario.measurement)}, {scenario.noise.name}, error scale"
             f" {scenario.error_scale:g}"
         )
 

@@ -36,7 +36,7 @@ def answer(asked: Asked, particles: int = 1000) -> Answered:
     from ipe_bench.runs.provenance import describe
     from ipe_bench.runs.run import validate
 
-    name = asked.measurement
+    name = asked.title
     scenario = asked.scenario
     trials = _TRIALS if asked.trials is None else asked.trials
     if trials > _MOST_TRIALS:

@@ -51,7 +51,7 @@ NAMES = {
     ),
     "figure_1": "the paper's set-up, and the 240 velocities of one trial with their errors",
     "one_track": "one trial: truth, readings, and two tracks with their 95 % bands",
-    "tracks": "errors of all trials at each epoch, a panel for each tracker, and NEES",
+    "tracks": "errors of all trials at each time step, a panel for each tracker, and NEES",
 }
 """Names and subjects of our figures; the names of files go on with the setting."""
 INDEX = "index.json"

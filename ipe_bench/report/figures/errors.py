@@ -26,7 +26,7 @@ BARS = (
     "Bars: 95 % intervals of success and of the mean NEES, errors from the median to the 95 %"
     " quantile."
 )
-_ALONG = " Success and NEES: at the last epoch. Error: over all epochs."
+_ALONG = " Success and NEES: at the last time step. Error: over all time steps."
 _NEES = ("nees_mean_low", "nees_mean_high")
 _ALL = 0.995
 """Success that all estimators have where they are alike."""
@@ -149,7 +149,7 @@ def draw_panels(
     words = {"heading": f"error over {view.reference}", "label": "median, bar to 95 %"}
     words |= {"most": CEILING["error_q95"], "interval": ("error_median", "error_q95")}
     if view.moving:
-        words["label"] = "over all epochs: median, bar to 95 %"
+        words["label"] = "over all time steps: median, bar to 95 %"
     common.decades(error, capped[["error_median", "error_q95"]], least=4.0)
     common.bound_line(error, 1.0, best)
     common.curves(error, rows, "error_median", *shown, **words)

@@ -277,4 +277,4 @@ def _draw_nis(ax: Axes, log: Log, one: LogTracks) -> str:
     share = percent(float(above.mean()))
     common.title(ax, f"NIS of {one.label}")
     right = f"{100 * ABOVE:g} % if right"
-    return f"NIS of {one.label} is above its limit at {share} of {len(nis)} epochs ({right})."
+    return f"NIS of {one.label} is above its limit at {share} of {len(nis)} time steps ({right})."

@@ -55,7 +55,7 @@ def draw(view: View) -> Iterator[Drawing]:
         "tracks",
         f"Errors of all tracks at error scale {value_text(scale)}",
         "Line: median over all trials. Shade: to the worst tenth; a track without an end counts as"
-        " infinite. Kept: the error at the last epoch is a success.",
+        " infinite. Kept: the error at the last time step is a success.",
         _claims(rows, claiming),
         f"Not shown, with larger errors: {enumerate_few(hidden, 8)}." if hidden else "",
     )
@@ -130,7 +130,9 @@ def _claims(rows: pd.DataFrame, claiming: list[str]) -> str:
         for label in claiming
         if firsts["claims"][label] < firsts["trials"][label]
     ]
-    bars = "Bars at the last epoch: the intervals of which verdicts are read." if claiming else ""
+    bars = (
+        "Bars at the last time step: the intervals of which verdicts are read." if claiming else ""
+    )
     return f"{bars} NEES: {enumerate_few(some, 8)}." if some else bars
 
 

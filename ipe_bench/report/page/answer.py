@@ -17,6 +17,7 @@ from ipe_bench.basics.errors import unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement, with_unit
+from ipe_bench.measurements.function import title_of
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.measurements.known import ConstrainedModel
 from ipe_bench.real.estimation import Question, nearer_starts
@@ -60,6 +61,12 @@ _FITS = {True: "yes", False: "NO", None: "not tested"}
 _INFLUENTIAL = 1.0
 """Standard errors by which a parameter moves without a reading from which on that reading is
 named."""
+_DOES = {
+    "auto": "searches for the best fit",
+    "linear_lse": "takes one linear step from the start",
+    "levenberg_marquardt": "is damped least squares",
+}
+"""What the usual estimators do."""
 _HIDDEN = 1e-3
 """Share of its error below which a value is written with figures of its own."""
 _MOST_FIGURES = 12
@@ -131,7 +138,7 @@ class Answer(Labelled[Fit]):
         with counting("estimate", len(question.estimators), progress) as begin:
             fitted = question.fitted(begin, examine=examine)
         ignored = ", ".join(question.ignored)
-        return cls(name or model.name, model, question.found.z, *fitted, ignored)
+        return cls(name or title_of(model), model, question.found.z, *fitted, ignored)
 
     @property
     def passes(self) -> bool:
@@ -344,7 +351,9 @@ def _estimates(answer: Answer) -> Table:
             failing = one.status.label.replace("_", " ").upper()
         cells = [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
         columns.append(texts(f"{one.label}: {failing}", cells))
-    return Table("estimates", f"{answer.name}: estimate ± standard error", "", columns)
+    meant = [f"{one.label} {_DOES[one.label]}" for one in answer.fits if one.label in _DOES]
+    notes = [Legend(f"{'; '.join(meant)}.")] if meant else []
+    return Table("estimates", f"{answer.name}: estimate ± standard error", "", columns, notes=notes)
 
 
 def with_error(value: float, error: float) -> str:
@@ -653,8 +662,8 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         if shift[i] >= _INFLUENTIAL:
             where = _where(labels[i])
             yield (
-                f"Dropping the reading at {where} moves one parameter by {shift[i]:.1f} standard"
-                " errors."
+                f"Without the reading at {where}, {names[int(found.moved[i])]} would move by"
+                f" {shift[i]:.1f} standard errors."
             )
     drawn = found.bootstrap.drawn
     lost = drawn - found.bootstrap.converged

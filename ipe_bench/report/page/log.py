@@ -38,15 +38,15 @@ TABLE = "track.csv"
 SCHEMA = 1
 _NOTE = (
     "NIS / m: mean square of innovations in predicted standard deviations; smoothers: cost of the"
-    " path. fit p: probability of a larger one. white p: Ljung and Box. Lost: from the epoch from"
-    " which most innovations exceed all but one in a million. The verdict is on innovations: an"
-    " error that readings do not show, such as the turn of a whole map, leaves it right."
+    " path. fit p: probability of a larger one. white p: Ljung and Box. Lost: from the time step"
+    " from which most innovations exceed all but one in a million. The verdict is on innovations:"
+    " an error that readings do not show, such as the turn of a whole map, leaves it right."
     " A dash: not available."
 )
 _OF_PARTICLES = (
     "Innovations of particles are by the mean and covariance of the readings that they predict;"
-    " effective particles: 1 / sum of squared weights, the median of all epochs; collapsed: below"
-    " 2."
+    " effective particles: 1 / sum of squared weights, the median of all time steps; collapsed:"
+    " below 2."
 )
 _OF_GATES = (
     "A reading whose own innovation, or distance from the path of all others (lm_ieks, auto), lies"
@@ -166,7 +166,7 @@ class LogAnswer(Labelled[LogTracks]):
         for one in self.tracks:
             ends = map(with_error, one.mean[-1], one.deviation[-1])
             columns.append(texts(one.label, ends))
-        return Table("last", "States at the last epoch ± standard deviation", "", columns)
+        return Table("last", "States at the last time step ± standard deviation", "", columns)
 
     def _constants(self) -> list[Table]:
         """Returns the table of constants that were found; none if all are known."""
@@ -226,7 +226,7 @@ def write_page(
             "A model fits if innovations (readings minus predictions) are as large as it predicts"
             " and do not resemble each other."
         ),
-        facts=[f"{readings} readings at {log.model.epochs} epochs"],
+        facts=[f"{readings} readings at {log.model.epochs} time steps"],
         sources=read_from(provenance),
     )
 

@@ -30,10 +30,10 @@ _OPEN = (
 )
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "tracks": (
-        "States over all epochs",
-        "Over all epochs; all: root mean square over the states, relative to the filter linearised"
-        " at the true path, or for smoothers, which use later readings too, to the smoother behind"
-        f" it; about 1 is good for either.{_OPEN}",
+        "States over all time steps",
+        "Over all time steps; all: root mean square over the states, relative to the filter"
+        " linearised at the true path, or for smoothers, which use later readings too, to the"
+        f" smoother behind it; about 1 is good for either.{_OPEN}",
         lambda rows: rows["path_bound"].notna(),
     ),
     "costs": (
@@ -284,7 +284,7 @@ def _published(rows: pd.DataFrame, collection: Collection) -> Table:
     models = [scenario.get("model", {}) for scenario in scenarios]
     sources = dict.fromkeys(model["source"] for model in models if "source" in model)
     caption = (
-        "Root mean square errors over all epochs of one stored path, beside those that are"
+        "Root mean square errors over all time steps of one stored path, beside those that are"
         f" published. {' '.join(sources)}"
     )
     title = "Published errors of trackers"

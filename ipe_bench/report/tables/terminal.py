@@ -66,10 +66,10 @@ _TOLD = (
     " levels."
 )
 TRACKED = (
-    "All columns are for the last epoch, where filters and smoothers have the same readings."
+    "All columns are for the last time step, where filters and smoothers have the same readings."
     " Success: the error lies in the gate (all but one in a million) of a filter"
     " linearised at the true path, or of the exact density where the reading of a single state"
-    " turns back. For whole paths see the table of all epochs. Cost: evaluations"
+    " turns back. For whole paths see the table of all time steps. Cost: evaluations"
     " of transition and reading."
 )
 """References of a track's errors."""
