@@ -11,9 +11,12 @@ import shlex
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.parse import unquote
 
 import make_docs as pages
 import notebooks
@@ -344,30 +347,44 @@ def test_what_is_stored_is_what_the_program_computes_today(name, tmp_path):
         )
 
 
-@pytest.mark.parametrize("page", WRITTEN, ids=ids)
-def test_links_lead_to_pages(page, generated):
-    for link in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text(encoding="utf-8")):
-        target = (page.parent / link).resolve()
-        made = generated / target.relative_to(PAGES.resolve())
-        drawings = word_drawings.DRAWINGS.get(page.parent.name, {})
-        drawn = link in {f"pictures/{name}.png" for name in drawings}
-        shown = drawn or link.startswith(("gallery/pictures/", "../gallery/pictures/"))
-        assert target.exists() or made.exists() or shown, link
+LINK = re.compile(r"""(?:\]\(|src(?:set)?=")(?!https?:|data:)([^)#"\s]*)#?([^)"\s]*)""")
+"""A link or a picture of a page, with its anchor."""
+ROOT = PAGES.parents[3]
+SOURCES = [
+    *WRITTEN,
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md")),
+    *(path for name in (".github", ".assets", "plugins") for path in ROOT.glob(f"{name}/**/*.md")),
+]
+"""All that readers of the repository find, without a site."""
+
+
+def headings(page: Path) -> list[str]:
+    """Returns the anchors of a page."""
+    text = page.read_text(encoding="utf-8")
+    return [slug(one) for one in re.findall(r"^#+ (.*)$", text, re.MULTILINE)]
+
+
+@pytest.mark.parametrize("page", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_somewhere_in_the_repository(page):
+    """Rows of checked.md are built, and followed by test_oracles."""
+    for link, anchor in LINK.findall(page.read_text(encoding="utf-8")):
+        target = (page.parent / link).resolve() if link else page
+        assert target.exists(), link
+        if anchor and target.suffix == ".md" and target.name != "checked.md":
+            assert anchor in headings(target), f"{link}#{anchor}"
+
+
+def test_a_page_that_the_site_builds_replaces_one_that_says_where_to_look(generated):
+    built = [path for path in WRITTEN if (generated / path.relative_to(PAGES)).exists()]
+    assert len(built) == 9
+    for path in built:
+        assert len(path.read_text(encoding="utf-8").split()) < 15
+        assert set(headings(path)) <= set(headings(generated / path.relative_to(PAGES)))
 
 
 def slug(heading: str) -> str:
     """Returns the anchor of a heading."""
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
-
-
-@pytest.mark.parametrize("page", WRITTEN, ids=ids)
-def test_links_lead_to_headings(page):
-    """Of written pages; the rows of checked.md are followed by test_oracles."""
-    for link, anchor in re.findall(r"\]\(([^)#]*)#([^)]+)\)", page.read_text(encoding="utf-8")):
-        target = (page.parent / link).resolve() if link else page
-        if target in WRITTEN and target.name != "checked.md":
-            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
-            assert anchor in [slug(one) for one in headings], f"{link}#{anchor}"
 
 
 def test_a_page_that_was_merged_leads_to_the_page_that_has_its_content(tmp_path):
@@ -706,6 +723,18 @@ def test_no_table_and_no_code_is_cut_at_1280_pixels(site, browser):
         assert browser.run(CUT) == [], page.relative_to(folder)
 
 
+def dead_links(html: Path) -> Iterator[str]:
+    """Yields the links of a site that lead to no file, or to no place on its page."""
+    texts = {path.resolve(): path.read_text(encoding="utf-8") for path in html.rglob("*.html")}
+    places = {path: set(re.findall(r'\bid="([^"]+)"', text)) for path, text in texts.items()}
+    for page, text in texts.items():
+        for link in re.findall(r'\b(?:href|src)="(?!\w+:|\{)([^"]+)"', text):
+            file, _, anchor = unquote(unescape(link)).partition("#")
+            target = (page.parent / file.partition("?")[0]).resolve() if file else page
+            if not target.exists() or (anchor and anchor not in places.get(target, {anchor})):
+                yield f"{page.name}: {link}"
+
+
 @pytest.mark.slow
 def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(site):
     """Every experiment, and a line about each that runs without a stored result."""
@@ -728,6 +757,7 @@ def test_the_whole_site_builds_without_a_warning_and_fetches_nothing(site):
     fetched = (
         r"""<(?:script|img|iframe|link(?=[^>]*stylesheet))[^>]*(?:src|href)=["']?(?:https?:)?//"""
     )
+    assert list(dead_links(html)) == []
     assert [
         page
         for page in html.rglob("*.html")

@@ -41,7 +41,10 @@ SUBJECTS = {
     "plugins": "Plugins",
 }
 """Headings of the page by the beginning of a test's path; the first that fits is its own."""
-HERE = "<!-- `make docs` writes the tables here -->\n"
+HERE = (
+    "`make docs` shows the rows of [oracles.json](../../../../../tests/oracles.json) here; an"
+    " anchor is the name of a test.\n"
+)
 """The line of the page that its tables replace."""
 
 

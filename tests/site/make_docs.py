@@ -25,7 +25,7 @@ import pandas as pd
 import stored_tables
 from gallery_frames import SUFFIX, Computed, read
 from notebooks import write_notebooks
-from readme import PICTURES, write_readme
+from readme import PICTURES, store_picture, write_readme
 from shared import oracles
 from state_tables import with_tables
 from word_drawings import write_drawings
@@ -132,6 +132,8 @@ SHOWN = SOURCES.parents[2] / ".assets" / "headline.md"
 """The stored report that the repository shows without a site."""
 STORED = SOURCES / "gallery"
 """The folder of what pages of the gallery are drawn from."""
+PICTURE = re.compile(r"!\[[^]]*\]\(([^)]+\.png)\)")
+"""A picture that a page shows, by its path."""
 TABLES = "explanation/tables_of_states.md"
 """The page of what is stored of the experiment `states`."""
 CHECKED = "reference/checked.md"
@@ -166,12 +168,17 @@ def build(output: Path, trials: int) -> int:
     write_notebooks(source)
     write_tables(source)
     write_gallery(source / "gallery", output / "results", trials)
-    shutil.copyfile(PICTURES[0], source / "gallery" / "pictures" / "success.png")
+    add_readme_picture(source)
     places = (output / "html", output / "doctrees")
     site = Sphinx(source, None, *places, "html", SETTINGS, warningiserror=True, freshenv=True)
     site.build()
     write_redirects(output / "html")
     return site.statuscode
+
+
+def add_readme_picture(source: Path) -> None:
+    """Adds README's picture to the gallery's."""
+    shutil.copyfile(PICTURES[0], source / "gallery" / "pictures" / "success.png")
 
 
 def write_redirects(html: Path) -> None:
@@ -447,6 +454,14 @@ def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
         yield link, f"{scale:g}", told, share, cost
 
 
+def store_pictures(source: Path) -> None:
+    """Stores the pictures that written pages show, for readers of the repository."""
+    for page in (SOURCES / "pages").rglob("*.md"):
+        folder = source / page.parent.relative_to(SOURCES / "pages")
+        for link in PICTURE.findall(page.read_text(encoding="utf-8")):
+            store_picture(folder / link, page.parent / link)
+
+
 def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
     """Computes the experiments that are named and keeps what their pages are drawn from; draws all
     pages again, and writes those of the repository."""
@@ -461,6 +476,9 @@ def store_all(output: Path, trials: int, names: Sequence[str]) -> int:
         if option.name == SHOWN.stem:
             write_text(SHOWN, stored_as_markdown(option))
             write_readme(computed.analysis)
+    write_drawings(output / "source")
+    add_readme_picture(output / "source")
+    store_pictures(output / "source")
     return 0
 
 

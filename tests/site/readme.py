@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from ipe_bench.basics.files import write_text
+from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.report.figures.headline import chosen, picture
 from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.page.headline import headline
@@ -84,10 +84,16 @@ def write_readme(analysis: Analysis) -> None:
 
 
 def save(view: View, path: Path, *, dark: bool = False) -> None:
-    """Saves the picture in few colours, which take a third of the room."""
+    """Saves the picture in few colours."""
+    picture(view, dark=dark).savefig(path, dpi="figure")
+    store_picture(path, path)
+
+
+def store_picture(drawn: Path, path: Path) -> None:
+    """Writes a picture in few colours, which take a third of the room."""
     from PIL import Image
 
-    picture(view, dark=dark).savefig(path, dpi="figure")
-    with Image.open(path) as image:
+    with Image.open(drawn) as image:
         few = image.convert("RGB").quantize(_COLORS, dither=Image.Dither.NONE)
+    make_folder(path.parent)
     few.save(path, optimize=True)

@@ -15,7 +15,7 @@ from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA, holm, mcnemar
 from ipe_bench.statistics.statistic import ALL
 
-HERE = "<!-- `make docs` writes the tables here -->\n"
+HERE = "(Tables: `make docs`.)\n"
 """The line of the page that its tables replace."""
 FIRST = "auto"
 """The tracker that is compared with all others in pairs."""

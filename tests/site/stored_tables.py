@@ -16,7 +16,7 @@ from ipe_bench.report.words import brief, share_text
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.statistic import ALL
 
-MARK = re.compile(r"^<!-- stored: (\w+) -->\n", re.MULTILINE)
+MARK = re.compile(r"^\(Table: `make docs`\.\) <!-- (\w+) -->\n", re.MULTILINE)
 """The line of a page that a table replaces."""
 _WORDS = ("success", "error", "NEES")
 _MANY = 100

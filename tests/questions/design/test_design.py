@@ -485,7 +485,7 @@ def test_at_an_estimate_all_is_of_that_point():
     assert len(seen.quartiles) == 0
     told = str(found)
     assert "function" not in told
-    assert "b1*(1-exp(-b2*t)), gaussian, at the estimate: what 6 readings determine" in told
+    assert "b1*(1 - exp(-b2*t)), gaussian, at the estimate: what 6 readings determine" in told
     assert "over the prior" not in told
     longer = bounds_of_demand(19.14, 0.531, [*SIX, 25])
     np.testing.assert_allclose(found.further.bounds[1] * [20.0, 0.5], longer, rtol=1e-9)
