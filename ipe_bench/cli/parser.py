@@ -131,7 +131,7 @@ What is assumed stands in the first lines. The same with keys:
 readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` names the
                     columns of a model. A missing reading is an empty cell.
                     A column sigma has standard deviations. With state_model=,
-                    a row per epoch and a column per reading.
+                    a row per time step, a column per reading.
 readings=[A,B]      several files, which share all parameters except
                     measurement.own=[NAME].
 noise.deviation=X   standard deviation of a reading, for standard errors and

@@ -113,7 +113,8 @@ def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: s
         *(
             (
                 [file, "uneven.csv"],
-                f"state_model=formulas state_model.file={file}{times} readings='uneven.csv'",
+                f"state_model=formulas state_model.file={file} state_model.title={Path(file).stem}"
+                f"{times} readings='uneven.csv'",
             )
             for file, times in {
                 "cart.yaml": " state_model.inputs.time=0",
