@@ -202,6 +202,8 @@ def test_rates_in_pieces_of_time_have_their_exact_solution(method, dose):
         ("-k*y if sin(2*pi*t) > 0.5 else 0", "compare t itself with a constant"),
         ("-k*y if (1 if t < 3 else 2) > 1.5 else 0", "compare t itself with a constant"),
         ("-k*y*sign(y - 0.5)", "a rate jumps at a moment"),
+        ("k if y**3 < 1e15 else 3*k", "a rate jumps at a moment"),
+        ("k*y if exp(y) < 1e10 else -k", "a rate jumps at a moment"),
         (
             "-k*y*floor(t)",
             "a rate jumps at a moment.*write comparisons of t where floor or mod is taken",
@@ -220,6 +222,15 @@ def test_a_jump_at_an_unknown_moment_is_refused(rate, message, method):
     model = Ode({"y": rate}, {"k": 0.3}, {"y": 1.0}, times=(1.0, 2.0, 5.0), method=method)
     with pytest.raises(UserError, match=message):
         model.simulate(model.nominal[None])
+
+
+@pytest.mark.parametrize(
+    "rate",
+    ["k*min(y**3, 1e15)", "k*min(exp(y), 1e10)", "k*max(exp(y) - 1e10, 0)", "k*sqrt(abs(y - 1e6))"],
+)
+def test_a_kink_is_no_jump_however_large_the_numbers_are_that_meet_in_it(rate):
+    model = Ode({"y": rate}, {"k": 0.3}, {"y": 1.0}, times=(0.1, 0.2))
+    assert np.isfinite(model.simulate(model.nominal[None])).all()
 
 
 @pytest.mark.parametrize("method", ["explicit", "implicit"])
