@@ -1,11 +1,10 @@
-"""Determines how finely each trial is integrated, by its parameters alone, and how coarsely its
-tangents may be.
+"""Determines how finely each trial is integrated, by its parameters alone.
 
-A rung is the number of equal steps between two readings. It is accepted if half of it shows, by
-step doubling, that it holds the tolerance on the whole span, and that the states converge: a
-reading that saturates is the same for any state that an unstable step leaves. Tangents inside
-iterations may be coarser: a Gauss-Newton step with a Jacobian J~ in place of J leaves |I - J~+ J|
-of the error, measured at the nominal parameters and carried over by the rung.
+A rung of the ladder is the number of equal steps between two readings. Rungs n and n/2 are compared
+(step doubling): where d is how far readings and states move between them, in shares of what they
+may, n/2 is accepted if 16 d is at most 1, and n if the error that a formula of eighth order then
+has left, 16 d / (2^8 - 1), is; else the trial climbs as far as that formula says. States are
+compared, too: a reading that saturates is the same for any state that an unstable step leaves.
 """
 
 from __future__ import annotations
@@ -24,17 +23,6 @@ ORDER = 8
 """Order of the integration formula: half the step leaves 2^-8 of the error."""
 SAFETY = 16.0
 """The estimate of an error may be this many times too small."""
-AIM = 1e-3
-"""The contraction of coarse tangents that is aimed at where it is measured or predicted; elsewhere
-it may be some times larger."""
-MOST_OF_FOURTH = 3
-"""Steps of the formula of fourth order, in place of one of eighth order, beyond which it gains
-nothing."""
-HIGHEST_OF_FOURTH = 2
-"""The highest rung at which it is tried: up to here its stages, 4 (rung + 1) at least, are not more
-than the 12 of a single step of eighth order."""
-LONGEST = 5
-"""Times that the steps of tangents may be longer than those of the readings."""
 STATES = 1e-4
 """Tolerance of the states, as a share of a state's largest magnitude in a trial."""
 NOT_FOLLOWED = 1e3
@@ -105,124 +93,109 @@ def search(
     unturned: Callable[[Array, Array], Array] = lambda h, z: h,
     in_doubt: Callable[[Array], Mask] = lambda states: np.zeros(len(states), dtype=bool),
 ) -> Found:
-    """Finds the coarsest rung at which readings hold `tolerance` (m,) and states `STATES`; compares
-    rungs n and n/2.
+    """Finds the coarsest rung at which readings hold `tolerance` (m,) and states `STATES`.
 
-    Where d is how far they move between them, n/2 is accepted if 16 d is within the tolerance, n if
-    the error that an eighth-order formula then has left, 16 d / (2^8 - 1), is; else n grows as that
-    formula says. Trials that do not get there end at the top of the ladder. The search begins at
-    the places `start` (trials,), and those at the top are accepted as they are; `simulate` fills
-    these rows of arrays (trials, m) and (trials, *states) with readings and states (cases, states,
-    times) at one rung, `unturned` shifts readings that are angles next to others, and `in_doubt`
-    selects trials by their states; a row behind these is held against nothing.
+    The search begins at the places `start` (trials,), 1 at least, and trials climb until they are
+    accepted or at the top of the ladder; those that begin there are accepted as they are.
+    `simulate` fills these rows of arrays (trials, m) and (trials, *states) with readings and states
+    (cases, states, times) at one rung, `unturned` shifts readings that are angles next to others,
+    and `in_doubt` selects trials by their states; a row behind these is held against nothing.
     """
-    top = len(rungs) - 1
-    places = start.copy()
-    final = start.copy()
-    lost, doubtful = np.zeros((2, len(start)), dtype=bool)
-    fine, coarse = np.empty((2, len(start), len(tolerance)))
-    y, near = np.empty((2, len(start), *states))
-    held = np.full(len(start), -1)  # the place whose readings are in `fine`
-    pending = computed = np.flatnonzero(start < top)
-    # Each round integrates the pending trials at their rung n, and at n/2 where it is not known.
+    search = _Search(rungs, tolerance, states, simulate, start, unturned, in_doubt)
+    # On a ladder of two rungs the top is all that can be tried.
+    pending = computed = np.flatnonzero(start < max(search.top, 2))
     while len(pending):
-        still = []
-        for place, rows in by_rung(places[pending], pending):
-            below = coarser(place)
-            # What an earlier round computed at n/2 serves again.
-            known = held[rows] == below
-            coarse[rows[known]] = fine[rows[known]]
-            near[rows[known]] = y[rows[known]]
-            if not known.all():
-                simulate(rows[~known], int(rungs[below]), coarse, near)
-            simulate(rows, int(rungs[place]), fine, y)
-            astray = apart(y[rows, :, :-1], near[rows, :, :-1])
-            with np.errstate(all="ignore"):
-                gaps = np.abs(fine[rows] - unturned(coarse[rows], fine[rows]))
-                shifts = (gaps / tolerance).max(axis=1)
-                moved = SAFETY * np.maximum(shifts, astray / STATES)
-            # Not a number where an iterate overflows: such a trial climbs to the top, in bounded
-            # time.
-            moved = np.nan_to_num(moved, nan=np.inf)
-            # Step doubling: d bounds the error of n/2 and, by the order p = 8, d / (2^p - 1) that
-            # of n (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section
-            # II.4).
-            left = moved / ((rungs[place] / rungs[below]) ** ORDER - 1.0)
-            enough = moved <= 1.0
-            good = (left <= 1.0) | (place == top)
-            # n/2 is good enough; or n is; else the trial climbs.
-            final[rows] = np.where(enough, below, place)
-            fine[rows[enough]] = coarse[rows[enough]]
-            # Where rounding shows, what finer steps move is what they leave; a stated rate promises
-            # the eighth order.
-            off = moved / SAFETY if states[1] else left
-            lost[rows] = (place == top) & (off > NOT_FOLLOWED)
-            if states[1]:
-                doubtful[rows] = np.where(enough, in_doubt(near[rows]), in_doubt(y[rows]))
-            held[rows] = place
-            # The error falls with the p-th power of the step: n <- n left^(1/p).
-            wanted = rungs[place] * np.minimum(left ** (1.0 / ORDER), _LARGEST_CLIMB)
-            places[rows] = np.clip(np.searchsorted(rungs, wanted), place + 1, top)
-            still.append(rows[~(enough | good)])
-        pending = np.concatenate(still)
-    return Found(final, computed, fine[computed], lost, doubtful)
+        climbing = []
+        for place, rows in by_rung(search.tried[pending], pending):
+            climbing.append(search.climbing(place, rows))
+        pending = np.concatenate(climbing)
+    return Found(search.found, computed, search.fine[computed], search.lost, search.doubtful)
 
 
-def tangent_contraction(coarse: Array, J: Array) -> float:
-    """Computes |I - J~+ J| in the spectral norm: the share of an error after a step with J~ (m, n)
-    in place of J."""
-    if not (np.isfinite(coarse).all() and np.isfinite(J).all()):
-        return np.inf
-    # Columns are scaled, so that the contraction does not depend on the parameters' units.
-    size = np.linalg.norm(J, axis=0)
-    size[size == 0] = 1.0
-    steps = np.linalg.lstsq(coarse / size, J / size, rcond=None)[0]
-    return float(np.linalg.norm(np.eye(J.shape[1]) - steps, 2))
+class _Search:
+    """Holds what a search knows of each trial: readings and states at its rung n and at n/2."""
 
+    def __init__(
+        self,
+        rungs: NDArray[np.int64],
+        tolerance: Array,
+        states: tuple[int, ...],
+        simulate: Callable[[Indices, int, Array, Array], None],
+        start: Indices,
+        unturned: Callable[[Array, Array], Array],
+        in_doubt: Callable[[Array], Mask],
+    ) -> None:
+        trials = len(start)
+        self.rungs = rungs
+        self.top = len(rungs) - 1
+        self.tolerance = tolerance
+        self.simulate = simulate
+        self.unturned = unturned
+        self.in_doubt = in_doubt
+        self.watched = states[1] > 0
+        """Whether there are states, of which steps may be in doubt; none where a rate is stated."""
+        self.tried = start.copy()
+        """The place of n."""
+        self.found = start.copy()
+        """The place that is accepted, or would be at the top."""
+        self.lost = np.zeros(trials, dtype=bool)
+        self.doubtful = np.zeros(trials, dtype=bool)
+        self.fine = np.empty((trials, len(tolerance)))
+        self.coarse = np.empty((trials, len(tolerance)))
+        self.fine_states = np.empty((trials, *states))
+        self.coarse_states = np.empty((trials, *states))
+        self.held = np.full(trials, -1)
+        """The place whose readings are in `fine`."""
 
-class Coarseness(NamedTuple):
-    """Holds how coarse the tangents inside an iteration may be, as measured at the nominal
-    parameters."""
+    def climbing(self, place: int, rows: Indices) -> Indices:
+        """Tries these trials at a place, and returns those that it does not suffice for."""
+        below = coarser(place)
+        self._integrate(place, below, rows)
+        moved = self._moved(rows)
+        # Step doubling: d bounds the error of n/2 and, by the order p = 8, d / (2^p - 1) that of n
+        # (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section II.4).
+        left = moved / ((self.rungs[place] / self.rungs[below]) ** ORDER - 1.0)
+        coarse_holds = moved <= 1.0
+        fine_holds = (left <= 1.0) | (place == self.top)
+        self.found[rows] = np.where(coarse_holds, below, place)
+        self.fine[rows[coarse_holds]] = self.coarse[rows[coarse_holds]]
+        # Where rounding shows, what finer steps move is what they leave; a stated rate promises the
+        # eighth order.
+        off = moved / SAFETY if self.watched else left
+        self.lost[rows] = (place == self.top) & (off > NOT_FOLLOWED)
+        if self.watched:
+            of_coarse = self.in_doubt(self.coarse_states[rows])
+            of_fine = self.in_doubt(self.fine_states[rows])
+            self.doubtful[rows] = np.where(coarse_holds, of_coarse, of_fine)
+        self.tried[rows] = self._next(place, left)
+        return rows[~(coarse_holds | fine_holds)]
 
-    fourth: int | None
-    """Steps of the formula of fourth order that contract enough at rung 1; None: none do."""
-    longer: float
-    """Ratio of the steps of tangents to those of the readings, both by the formula of eighth
-    order."""
+    def _integrate(self, place: int, below: int, rows: Indices) -> None:
+        """Computes readings and states at n, and at n/2 unless an earlier round computed them."""
+        known = self.held[rows] == below
+        self.coarse[rows[known]] = self.fine[rows[known]]
+        self.coarse_states[rows[known]] = self.fine_states[rows[known]]
+        if not known.all():
+            self.simulate(rows[~known], int(self.rungs[below]), self.coarse, self.coarse_states)
+        self.simulate(rows, int(self.rungs[place]), self.fine, self.fine_states)
+        self.held[rows] = place
 
-    def steps(self, rung: int) -> tuple[bool, int]:
-        """Returns whether the formula is that of fourth order, and the steps between two readings,
-        for trials at this rung; 0 stands for trials whose rung is known without a search."""
-        # Eighth order: the steps of the readings, as many times longer as was measured to contract.
-        if rung > HIGHEST_OF_FOURTH or self.fourth is None:
-            fewer = max(rung, 1) / self.longer
-            return False, max(1, int(np.ceil(fewer)))
-        # The formula of fourth order loses more by what a trial turns faster than the nominal one:
-        # at rung 1 there is 2^4 in hand, at rung 2 it is 3^4.
-        return True, self.fourth * (rung + 1 if rung else 1)
+    def _moved(self, rows: Indices) -> Array:
+        """Computes how far readings and states move from n/2 to n, in shares of what they may; not
+        a number, as where an iterate overflows, is infinitely far: such a trial climbs to the top,
+        in bounded time."""
+        fine = self.fine[rows]
+        # The last row behind the states tells of doubts, and is none of them.
+        astray = apart(self.fine_states[rows, :, :-1], self.coarse_states[rows, :, :-1])
+        with np.errstate(all="ignore"):
+            gaps = np.abs(fine - self.unturned(self.coarse[rows], fine))
+            shifts = (gaps / self.tolerance).max(axis=1)
+            moved = SAFETY * np.maximum(shifts, astray / STATES)
+        return np.nan_to_num(moved, nan=np.inf)
 
-
-def fewest_of_fourth(tangents: Callable[[int], Array], J: Array) -> int | None:
-    """Returns the fewest steps k of the formula of fourth order for which tangents(k) (m, n)
-    contract enough beside J (m, n), or None."""
-    for k in range(1, MOST_OF_FOURTH + 1):
-        if tangent_contraction(tangents(k), J) <= AIM:
-            return k
-    return None
-
-
-def times_longer(off: Array, coarse: Array, J: Array) -> float:
-    """Returns how many times longer than those of the readings the steps of tangents may be, from
-    longer ones: `off` (m,) is by how much they change the readings, in tolerances, and `coarse` (m,
-    n) is their Jacobian.
-
-    Readings are held to 1/`SAFETY` of the tolerance; the contraction grows with the error, and so
-    with the eighth power of the step.
-    """
-    with np.errstate(all="ignore"):
-        sensitivity = tangent_contraction(coarse, J) / off.max()
-    if not np.isfinite(sensitivity):
-        return 1.0
-    # contraction = sensitivity * error, error ~ h^8: the ratio of steps that reaches the aim.
-    longer = (SAFETY * AIM / sensitivity) ** (1 / ORDER) if sensitivity > 0 else np.inf
-    return float(np.clip(longer, 1.0, LONGEST))
+    def _next(self, place: int, left: Array) -> Indices:
+        """Returns the places to try next, one further at least. The error falls with the p-th power
+        of the step: n <- n left^(1/p)."""
+        climb = np.minimum(left ** (1.0 / ORDER), _LARGEST_CLIMB)
+        wanted = self.rungs[place] * climb
+        return np.clip(np.searchsorted(self.rungs, wanted), place + 1, self.top)

@@ -12,7 +12,7 @@ from shared.slopes import differentiate
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.engine import tableaus
-from ipe_bench.engine.ladder import tangent_contraction
+from ipe_bench.engine.coarseness import tangent_contraction
 from ipe_bench.engine.trace import Graph
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
 

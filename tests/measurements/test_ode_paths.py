@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import erf, erfc
 from shared.by_numpy import by_numpy
 
-from ipe_bench.engine.ladder import tangent_contraction
+from ipe_bench.engine.coarseness import tangent_contraction
 from ipe_bench.engine.tableaus import DOP853
 from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter, SubsetModel
 from ipe_bench.measurements.arithmetic import FUNCTIONS, PAIRS, SEVERAL
@@ -435,3 +435,32 @@ def test_a_reading_at_the_start_is_the_state_at_the_start():
         np.testing.assert_allclose(model.jacobian(x), slopes, atol=1e-6)
         start = hares.simulate(scale * hares.nominal[None])[0, :2]
         assert start == pytest.approx([34.0 * scale, 5.9 * scale], rel=1e-14)
+
+
+@dataclass(frozen=True)
+class Decay(OdeMeasurement):
+    """Decay from 1 whose steps may be half of the interval between readings, and no shorter."""
+
+    states, outputs = 1, ("amount",)
+    tolerance, shortest_step = 1e-6, 0.2
+    parameters = (Parameter("k", "1/s", 1.0),)
+    nominal = np.array([1.0])
+    times = np.arange(0.5, 3.0, 0.5)
+
+    def start(self, p, c):
+        return (1.0,)
+
+    def rhs(self, t, y, p, c):
+        return (-p[0] * y[0],)
+
+    def read(self, t, y, p, c):
+        return (y[0],)
+
+
+def test_where_two_step_lengths_are_allowed_they_are_held_against_each_other():
+    model = Decay()
+    z = model.simulate(np.array([[1.0], [3.0], [60.0]]))
+    np.testing.assert_allclose(z[0], np.exp(-model.times), rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(z[1], np.exp(-3.0 * model.times), rtol=0.0, atol=1e-6)
+    # Steps of 0.25 s are unstable where k h = 15.
+    assert np.isnan(z[2]).all()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, finite, own
-from ipe_bench.engine import ladder, watch
+from ipe_bench.engine import coarseness, ladder, watch
 from ipe_bench.engine.equations import Equations, Recording, Variation
 from ipe_bench.engine.integrator import Kernel, compiled_rates
 from ipe_bench.engine.jumps import jumps
@@ -478,7 +478,7 @@ class OdeMeasurement(Measurement):
         parameters need."""
         top = len(self._rungs) - 1
         if self._rate_function is None:
-            usual = min(self._nominal_place, top - 1)
+            usual = max(1, min(self._nominal_place, top - 1))
             return np.where(finite(x), usual, top)
         turned = self._rates(x) * self._longest
         wanted = np.nan_to_num(turned / _ANGLE_AT_START, nan=np.inf)
@@ -573,7 +573,7 @@ class OdeMeasurement(Measurement):
         return self._rk4_kernel if fourth else self._jacobian_kernel, steps
 
     @cached_property
-    def _coarseness(self) -> ladder.Coarseness:
+    def _coarseness(self) -> coarseness.Coarseness:
         """How much longer the steps of tangents may be, as measured at the start."""
         x = own(self.nominal[None])
         stop = len(self.times)
@@ -584,11 +584,11 @@ class OdeMeasurement(Measurement):
             return self._tangents(x, stop, [(self._rk4_kernel, k, np.arange(1))])[0]
 
         fourth = None
-        if rung <= ladder.HIGHEST_OF_FOURTH:
-            fourth = ladder.fewest_of_fourth(of_fourth, J[0])
+        if rung <= coarseness.HIGHEST_OF_FOURTH:
+            fourth = coarseness.fewest_of_fourth(of_fourth, J[0])
         # Half the rung; where that is half a step, every second reading.
         if rung == 1 and (stop == 1 or self.driven is not None):
-            return ladder.Coarseness(fourth, 1.0)
+            return coarseness.Coarseness(fourth, 1.0)
         every = slice(None) if rung > 1 else slice(1, None, 2)
         rows = np.arange(self.m).reshape(self.tables.shape[1], stop, -1)[:, every].ravel()
         times = np.ascontiguousarray(self._times[every])
@@ -601,7 +601,7 @@ class OdeMeasurement(Measurement):
         exact = self._shown(x, stop, self._zeros)[:, rows]
         with np.errstate(all="ignore"):
             off = np.abs(z - exact) / self._tolerances[rows]
-        return ladder.Coarseness(fourth, ladder.times_longer(off, coarse[0], J[0, rows]))
+        return coarseness.Coarseness(fourth, coarseness.times_longer(off, coarse[0], J[0, rows]))
 
     @property
     def _nominal_rung(self) -> int:
