@@ -4,34 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from ipe_bench.questions.own.maths import Claim, Own, Point
+from ipe_bench.real.profiles import CONFIDENCE
 from ipe_bench.report.page.writer import write_files
 from ipe_bench.report.tables.table import Part, Strong, Table, texts, words
 from ipe_bench.report.words import compact, duration
 
 NAME = "own"
 TABLE = "own.csv"
-_ROBUST = ("auto", "levenberg_marquardt")
-"""Estimators that are taken before others that do as well, since starts and data differ."""
 _MISSES = 0.95
 """Share of data sets up to which an estimator is said to miss the best fit, if its interval lies
 below."""
 _NONE = 0.9
 """Likewise, the share below which none is taken."""
 _TOO_SMALL = 0.88
-"""Share of 95 % intervals that contain the truth below which they are said to be too small: of one
-estimate, this verdict is true of fresh data sets in nine of ten cases."""
+"""Share of 95 % intervals that contain the truth below which they are said to be too small, unless
+chance explains it: of one estimate, this verdict is true of fresh data sets in nine of ten
+cases."""
 _TOO_LARGE = 0.75
 """Share of their width that would do, below which they are said to be too large."""
 _FAR = 100.0
 """Factor from which on error bars are wrong by far."""
-_CHEAPER = 5.0
-"""Factor of the cost from which it is named."""
 
 
 def ranked(own: Own, point: Point) -> list[Claim]:
@@ -40,14 +39,11 @@ def ranked(own: Own, point: Point) -> list[Claim]:
 
 
 def taken(own: Own, point: Point) -> Claim | None:
-    """Chooses among those that find the best fit as often as any: one whose error bars are right,
-    and then the most robust. None: no estimator is ranked."""
+    """Chooses among those that find the best fit as often as any: of those whose error bars are
+    right, the cheapest. None: no estimator is ranked."""
     equal = _equal(own, point)
     right = [one for one in equal if _bars(one) == "about right"]
-    by_label = {one.label: one for one in right or equal}
-    robust = [by_label[label] for label in _ROBUST if label in by_label]
-    best_first = [*robust, *right, *equal]
-    return best_first[0] if best_first else None
+    return min(right or equal, key=lambda one: one.cost, default=None)
 
 
 def _equal(own: Own, point: Point) -> list[Claim]:
@@ -67,7 +63,8 @@ def hardest(own: Own) -> Point:
     for same in zip(*(point.claims for point in own.points), strict=True):
         worst = min(same, key=lambda one: one.found)
         least = min(same, key=lambda one: one.held)
-        claims.append(replace(worst, held=least.held, worst=least.worst, factor=least.factor))
+        inside = tuple(chain.from_iterable(one.inside for one in same))
+        claims.append(replace(worst, inside=inside, worst=least.worst, factor=least.factor))
     where = min(own.points, key=lambda point: sum(one.found for one in ranked(own, point)))
     return replace(where, claims=claims)
 
@@ -79,14 +76,15 @@ def takes_one(own: Own) -> bool:
 
 
 def _bars(one: Claim) -> str:
-    if one.holds < _TOO_SMALL:
+    if one.holds < _TOO_SMALL and one.holds_between[1] < CONFIDENCE:
         return "too small"
     return "too large" if one.factor < _TOO_LARGE else "about right"
 
 
 def _bars_in_words(one: Claim) -> str:
     verdict = _bars(one)
-    share = f"{_about(one.holds)} contain the truth"
+    low, high = one.holds_between
+    share = f"{100 * low:.0f} to {100 * high:.0f} % contain the truth"
     if verdict == "about right":
         return f"its error bars are about right ({share})"
     factor = one.factor if verdict == "too small" else 1.0 / one.factor
@@ -152,7 +150,7 @@ def sentences(own: Own) -> Iterator[str]:
         number = len(own.points) + own.further
         yield f"Your data have {number} answers that fit: {'. And '.join(each)}."
     worst = hardest(own)
-    yield from _cheaper(own, worst)
+    yield from _dearer(own, worst)
     told = list(_told_a_prior(own, worst))
     if told:
         yield f"Not ranked, because they need a prior, which you did not state: {'; '.join(told)}."
@@ -172,19 +170,18 @@ def _told_a_prior(own: Own, point: Point) -> Iterator[str]:
         yield f"with the prior {told}, {_missing(own, claims) or f'{labels} {verb} the best fit'}"
 
 
-def _cheaper(own: Own, point: Point) -> Iterator[str]:
-    """Names the cheapest estimator that does as well at a small share of the cost."""
+def _dearer(own: Own, point: Point) -> Iterator[str]:
+    """Says what others cost that do as well as the one that is taken."""
     best = taken(own, point)
     if best is None or not takes_one(own):
         return
-    equal = [one for one in _equal(own, point) if _bars(one) == _bars(best)]
-    cheapest = min(equal, key=lambda one: one.cost, default=best)
-    factor = best.cost / max(cheapest.cost, 1.0)
-    if factor >= _CHEAPER:
-        verb = "keeps the track" if own.moving else "finds the best fit"
+    equal = [one for one in _equal(own, point) if _bars(one) == _bars(best) and one is not best]
+    equal.sort(key=lambda one: one.cost)
+    costs = [f"{one.label} {one.cost / max(best.cost, 1.0):.2g} times" for one in equal]
+    if costs:
         yield (
-            f"{cheapest.label} {verb} about as often from this start, and costs about"
-            f" {factor:.0f} times less."
+            f"Those that do as well from this start cost more than {best.label}:"
+            f" {', '.join(costs)} as much."
         )
 
 
@@ -205,7 +202,7 @@ def _table(name: str, own: Own, point: Point, number: int) -> Table:
         words("estimator", [one.label for one in claims]),
         words("prior", [one.told for one in claims]),
         texts("keeps track, %" if own.moving else "finds, %", _shares(claims, "finds")),
-        texts("truth in 95 % bars, %", _shares(claims, "holds")),
+        texts("truth in 95 % bars, %", [_holding(one) for one in claims]),
         words("worst", [one.worst for one in claims]),
         texts("factor", [f"{one.factor:.2g}" for one in claims]),
         texts("cost", [compact(one.cost) for one in claims]),
@@ -221,6 +218,11 @@ def _shares(claims: Sequence[Claim], key: str) -> list[str]:
     return [f"{100 * getattr(one, key):.1f}" for one in claims]
 
 
+def _holding(one: Claim) -> str:
+    low, high = one.holds_between
+    return f"{100 * one.holds:.1f} ({100 * low:.0f} to {100 * high:.0f})"
+
+
 def _meaning(own: Own) -> str:
     if own.moving:
         return (
@@ -231,7 +233,8 @@ def _meaning(own: Own) -> str:
     return (
         "finds: the answer's readings lie closer to the best fit's than noise puts the"
         " best fit to the truth. bars: 95 % intervals as `estimate` prints them, of the worst"
-        " parameter. factor: by which they would be right. cost: median evaluations of the model."
+        " parameter, with the range that chance leaves. factor: by which they would be right."
+        " cost: median evaluations of the model."
         f" Shares are of all {own.trials} data sets, whether the best fit was found or not, and"
         " approximate: the truth is your estimate, which is uncertain too."
     )
@@ -254,6 +257,8 @@ def frame(own: Own) -> pd.DataFrame:
                     "finds_low": low,
                     "finds_high": high,
                     "holds": one.holds,
+                    "holds_low": one.holds_between[0],
+                    "holds_high": one.holds_between[1],
                     "worst": one.worst,
                     "too_small_by": one.factor,
                     "cost": one.cost,

@@ -49,8 +49,8 @@ class Claim:
     trials: int
     found: int
     """Data sets in which it found the best fit, or kept the track."""
-    held: int
-    """Data sets in which the 95 % interval of the worst parameter held the truth."""
+    inside: tuple[int, ...]
+    """Data sets in which the 95 % interval held the truth, for each parameter."""
     worst: str
     """That parameter."""
     factor: float
@@ -65,8 +65,22 @@ class Claim:
         return self.found / self.trials
 
     @property
+    def held(self) -> int:
+        """Data sets in which the interval of the worst parameter held the truth."""
+        return min(self.inside)
+
+    @property
     def holds(self) -> float:
         return self.held / self.trials
+
+    @property
+    def holds_between(self) -> tuple[float, float]:
+        """The 95 % interval of the share of the worst parameter, whichever that is: each share has
+        an interval that all hold together (Bonferroni)."""
+        level = 1.0 - (1.0 - CONFIDENCE) / len(self.inside)
+        ends = [clopper_pearson(held, self.trials, level) for held in self.inside]
+        low, high = np.min(ends, axis=0).tolist()
+        return low, high
 
     @property
     def finds_between(self) -> tuple[float, float]:
@@ -345,7 +359,7 @@ def _claim(
         told,
         trials=len(width),
         found=int(near.sum()),
-        held=int(inside[worst]),
+        inside=tuple(inside.tolist()),
         worst=model.physical_parameters[worst].name,
         factor=float(np.quantile(ratio[:, worst], CONFIDENCE, method="higher")),
         cost=float(np.median(cost(each.simulations, each.jacobians, model.jacobian_cost))),

@@ -64,7 +64,7 @@ def own_log(
                 "",
                 trials,
                 found=int(np.sum(kept["success"])),
-                held=int(inside[worst]),
+                inside=tuple(inside.tolist()),
                 worst=names[worst],
                 factor=float(factor),
                 cost=float(np.median(estimates.simulations)),
