@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice, pairwise
-from typing import ClassVar, Literal
+from itertools import pairwise
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.algebra import factor, lower_solve, root, transposed
 from ipe_bench.states.base import StateModel
+from ipe_bench.states.passes import kept_of
 from ipe_bench.states.trackers import Tracker, Tracks
 
 _FAR = 1e8
@@ -26,8 +27,8 @@ _LOST = 3e13
 _NUMBERS = 2e7
 """Numbers of the largest matrix of a trial at most, which takes a gigabyte with what is made of
 it."""
-_AT_ONCE = 1e6
-"""Numbers of the slopes of trials that are held at once, unless one trial has more."""
+_AT_ONCE = 2e6
+"""Numbers of the largest matrices of trials that are held at once, unless one trial has more."""
 
 
 @dataclass(frozen=True)
@@ -89,21 +90,19 @@ class PathIPE(Tracker):
         out.iterations = np.empty(trials, np.int64)
         # Trials in which the same readings are missing have the same frozen system.
         seen, pattern = np.unique(np.isfinite(z), axis=0, return_inverse=True)
-        at_once = max(1, int(_AT_ONCE / (sum(_widths(model)) * model.n * model.epochs)))
         for i, there in enumerate(seen):
-            frozen = _Frozen.of(model, there)
-            alike = np.flatnonzero(pattern.reshape(-1) == i)
-            for rows in np.split(alike, range(at_once, len(alike), at_once)):
-                at = self._iterated(frozen, np.where(there, z[rows], 0.0))
-                P = frozen.covariances(at)
-                out.mean[rows] = at.x[:, 1:]
-                out.covariance[rows] = P[:, 1:]
-                out.start.mean[rows] = at.x[:, 0]
-                out.start.covariance[rows] = P[:, 0]
-                out.cost[rows] = np.sum(at.u**2, axis=1) + np.sum(at.r**2, axis=1)
-                out.status[rows] = at.status
-                out.iterations[rows] = at.iterations
-                out.calls[rows] = at.calls
+            frozen = _Frozen.kept(model, there)
+            rows = np.flatnonzero(pattern.reshape(-1) == i)
+            at = self._iterated(frozen, np.where(there, z[rows], 0.0))
+            P = frozen.covariances(at)
+            out.mean[rows] = at.x[:, 1:]
+            out.covariance[rows] = P[:, 1:]
+            out.start.mean[rows] = at.x[:, 0]
+            out.start.covariance[rows] = P[:, 0]
+            out.cost[rows] = np.sum(at.u**2, axis=1) + np.sum(at.r**2, axis=1)
+            out.status[rows] = at.status
+            out.iterations[rows] = at.iterations
+            out.calls[rows] = at.calls
         return out
 
     def _iterated(self, frozen: _Frozen, z: Array) -> _Iterates:
@@ -136,8 +135,7 @@ class PathIPE(Tracker):
             # Eq. (17): u <- u - F(u);  eq. (20): u <- u - J_F^-1 F(u)
             step = F[going]
             if self.method == "newton":
-                B = frozen.slopes(at.x[active])[1]
-                step, at.singular[active] = frozen.divided(step, B)
+                step, at.singular[active] = frozen.divided(step, at.x[active])
                 at.calls[active] += (1 + model.n) * model.evaluations
             at.u[active] -= step
             at.x[active], at.r[active] = frozen.run(at.u[active], z[active])
@@ -169,6 +167,15 @@ def _widths(model: StateModel) -> list[int]:
     return [root(model.prior.covariance).shape[1], *steps]
 
 
+class _Slopes(NamedTuple):
+    """Holds slopes along paths."""
+
+    F: Array
+    """df/dx (..., K, n, n)."""
+    H: Array
+    """dh/dx (..., K, m, n), whitened; 0 for missing readings."""
+
+
 @dataclass(frozen=True)
 class _Frozen:
     """Holds the system of eq. (11) for the path of a model, of whose K m readings those of `seen`
@@ -182,11 +189,24 @@ class _Frozen:
     """(K, m)"""
     whitening: Array
     """L^-1 (K, m, m) of the covariances L L' of the readings of each epoch."""
-    A: Array
-    """dh/du (M, N) at u = 0, whitened; 0 for missing readings."""
+    slopes: _Slopes
+    """Along the path of the prior's mean."""
     Q: Array
     """Orthonormal columns (N + M, N) of (I; A) = Q T with a triangular T: with Q = (Q1; Q2), it is
     (I + A' A)^-1 = Q1 Q1' and (I + A' A)^-1 A' = Q1 Q2', and nothing is squared."""
+
+    @classmethod
+    def kept(cls, model: StateModel, seen: Array) -> _Frozen:
+        """Returns the system of these readings, which the model keeps for its next trials unless it
+        is large."""
+        kept = kept_of(model)
+        last = kept.get("frozen")
+        if last is not None and np.array_equal(last.seen, seen):
+            return last
+        found = cls.of(model, seen)
+        if found.Q.size <= _AT_ONCE:
+            kept["frozen"] = found
+        return found
 
     @classmethod
     def of(cls, model: StateModel, seen: Array) -> _Frozen:
@@ -200,15 +220,18 @@ class _Frozen:
         R = np.where(both, [model.R(k) for k in epochs], np.eye(m))
         whitening = lower_solve(factor(R), np.eye(m))
         none = np.empty(0)
-        start = cls(model, gains, seen, whitening, none, none)
+        start = cls(model, gains, seen, whitening, _Slopes(none, none), none)
         # A = dh/du at u = 0, the path of the prior's mean.
-        u = np.zeros((1, start.unknowns[-1].stop))
-        x, _ = start.run(u, np.zeros((1, *seen.shape)))
-        A = start.slopes(x)[1][0]
-        Q = np.linalg.qr(np.concatenate([np.eye(A.shape[1]), A]))[0]
+        N = start.unknowns[-1].stop
+        x, _ = start.run(np.zeros((1, N)), np.zeros((1, *seen.shape)))
+        slopes = _Slopes(*(part[0] for part in start.slopes_along(x)))
+        one = np.eye(N)
+        X = start._moved(slopes.F, one)
+        A = np.matmul(slopes.H, X[1:]).reshape(-1, N)
+        Q = np.linalg.qr(np.concatenate([one, A]))[0]
         if np.linalg.norm(A, axis=1).max() > _LOST:
             Q[:] = np.nan
-        return replace(start, A=A, Q=Q)
+        return replace(start, slopes=slopes, Q=Q)
 
     @cached_property
     def unknowns(self) -> list[slice]:
@@ -262,61 +285,102 @@ class _Frozen:
         status = np.full(trials, Status.RUNNING, np.int8)
         return _Iterates(u, x, r, calls, singular, status, np.zeros(trials, np.int64))
 
-    def slopes(self, x: Array) -> tuple[Array, Array]:
-        """Computes df/dx (trials, K, n, n) along the states x (trials, 1 + K, n), and dh/du
-        (trials, M, N), whitened."""
+    def slopes_along(self, x: Array) -> _Slopes:
+        """Computes the slopes along states x (trials, 1 + K, n)."""
         along = self.model.slopes_along(x)
         H = np.matmul(self.whitening, np.where(self.seen[..., None], along.H, 0.0))
-        N = self.unknowns[-1].stop
-        one = np.broadcast_to(np.eye(N), (len(x), N, N))
-        # dh_k/du = H_k dx_k/du; nothing is read of the start.
-        X = islice(self._moved(along.F, one), 1, None)
-        B = [np.matmul(H[:, k], X_k) for k, X_k in enumerate(X)]
-        return along.F, np.concatenate(B, axis=1)
+        return _Slopes(along.F, H)
 
-    def _moved(self, F: Array, D: Array) -> Iterator[Array]:
-        """Yields what a change D (trials, N, p) of u changes of the start and of the states at each
-        epoch (trials, n, p), by the slopes F of the transitions."""
-        X = np.matmul(self.gains[0], D[:, self.unknowns[0]])
-        yield X
+    def _moved(self, F: Array, D: Array) -> Array:
+        """Computes what changes D (..., N, p) of u change of the start and of the states at each
+        epoch (1 + K, ..., n, p), by the slopes F (..., K, n, n) of the transitions."""
+        X = np.matmul(self.gains[0], D[..., self.unknowns[0], :])
+        out = np.empty((1 + self.model.epochs, *X.shape))
+        out[0] = X
         for k in range(self.model.epochs):
             # dx_k = F_k dx_k-1 + G_k du_k
-            noise = np.matmul(self.gains[k + 1], D[:, self.unknowns[k + 1]])
-            X = np.matmul(F[:, k], X) + noise
-            yield X
+            noise = np.matmul(self.gains[k + 1], D[..., self.unknowns[k + 1], :])
+            np.add(np.matmul(F[..., k, :, :], out[k]), noise, out=out[k + 1])
+        return out
+
+    def _changed(self, slopes: _Slopes, moved: Array) -> Array:
+        """Computes (B - A) D (trials, M, p), of which the frozen slopes move the states by X D
+        (1 + K, ..., n, p).
+
+        Where the slopes are the frozen ones it is 0, and no difference of large numbers.
+        """
+        F = slopes.F - self.slopes.F
+        H = slopes.H - self.slopes.H
+        change = np.zeros((len(F), *moved.shape[-2:]))
+        out = []
+        for k in range(self.model.epochs):
+            # With dx = X D and dx + e by the slopes of B: e_k = F_k e_k-1 + (F_k - F0_k) dx_k-1.
+            change = np.matmul(slopes.F[:, k], change) + np.matmul(F[:, k], moved[k])
+            out.append(np.matmul(slopes.H[:, k], change) + np.matmul(H[:, k], moved[k + 1]))
+        return np.concatenate(out, axis=1)
 
     def F(self, u: Array, r: Array) -> Array:
         """Computes eq. (11), H+ (h - z) (trials, N), for h - z = (u; r)."""
         return multiply(self.inverse, np.concatenate([u, r], axis=1))
 
-    def divided(self, F: Array, B: Array) -> tuple[Array, Array]:
-        """Computes J_F^-1 F (trials, N), J_F = I + (I + A' A)^-1 A' (B - A), by M equations in
-        place of N (Woodbury), and whether there is none."""
-        C, core = self._changed(B)
-        w, singular = solve(core, multiply(C, F))
-        return F - multiply(self.gain, w), singular & finite(F)
+    def divided(self, F: Array, x: Array) -> tuple[Array, Array]:
+        """Computes J_F^-1 F (trials, N) at states x (trials, 1 + K, n), J_F = I + (I + A' A)^-1 A'
+        (B - A), by M equations in place of N (Woodbury), and whether there is none:
 
-    def _changed(self, B: Array) -> tuple[Array, Array]:
-        """Computes C = B - A (trials, M, N) and I + C gain (trials, M, M): J_F = I + gain C, and by
-        Woodbury's formula J_F^-1 = I - gain (I + C gain)^-1 C."""
-        C = B - self.A
-        return C, np.eye(len(self.A)) + np.matmul(C, self.gain)
+        J_F^-1 = I - gain (I + C gain)^-1 C,   C = B - A.
+        """
+        out = np.empty_like(F)
+        singular = np.zeros(len(F), dtype=bool)
+        for rows in self._pieces(len(F)):
+            slopes = self.slopes_along(x[rows])
+            columns = F[rows][..., None]
+            C_F = self._changed(slopes, self._moved(self.slopes.F, columns))
+            w, none = solve(self._core(slopes), C_F)
+            out[rows] = F[rows] - multiply(self.gain, w[..., 0])
+            singular[rows] = none & finite(F[rows])
+        return out, singular
+
+    def _core(self, slopes: _Slopes) -> Array:
+        """Computes I + C gain (trials, M, M)."""
+        C_gain = self._changed(slopes, self._moved_gain)
+        return np.eye(C_gain.shape[1]) + C_gain
+
+    def _pieces(self, trials: int) -> Iterator[slice]:
+        """Yields the trials whose matrices are held at once."""
+        M = self.seen.size
+        at_once = max(1, int(_AT_ONCE / (M * max(M, len(self.gain)))))
+        for i in range(0, trials, at_once):
+            yield slice(i, i + at_once)
+
+    @cached_property
+    def _moved_gain(self) -> Array:
+        return self._moved(self.slopes.F, self.gain)
+
+    @cached_property
+    def _moved_root(self) -> Array:
+        N = self.Q.shape[1]
+        return self._moved(self.slopes.F, self.Q[:N])
 
     def covariances(self, at: _Iterates) -> Array:
         """Computes the covariances (trials, 1 + K, n, n) of the states of iterates; NaN of those
         that are not finite."""
         n = self.model.n
         P = np.full((*at.x.shape, n), np.nan)
-        usable = finite(at.x) & finite(at.u)
-        if usable.any():
-            P[usable] = self.sandwich(*self.slopes(at.x[usable]))
-            at.calls[usable] += (1 + n) * self.model.evaluations
+        usable = np.flatnonzero(finite(at.x) & finite(at.u))
+        for piece in self._pieces(len(usable)):
+            rows = usable[piece]
+            P[rows] = self.sandwich(self.slopes_along(at.x[rows]))
+        at.calls[usable] += (1 + n) * self.model.evaluations
         return P
 
-    def sandwich(self, F: Array, B: Array) -> Array:
-        """Computes the covariances (trials, 1 + K, n, n) of the states at the root: T T' with T = X
-        J_F^-1 H+ and X = dx/du, which moves from epoch to epoch as states do."""
-        C, core = self._changed(B)
-        W, _ = solve(core, np.matmul(C, self.inverse))
-        moved = self._moved(F, self.inverse - np.matmul(self.gain, W))
-        return np.stack([np.matmul(T, transposed(T)) for T in moved], axis=1)
+    def sandwich(self, slopes: _Slopes) -> Array:
+        """Computes the covariances (trials, 1 + K, n, n) of the states at the root: X J_F^-1 H+ H+'
+        J_F^-' X' with X = dx/du, which moves from epoch to epoch as states do.
+
+        H+ H+' = (I + A' A)^-1 = Q1 Q1'.
+        """
+        N = self.Q.shape[1]
+        W, _ = solve(self._core(slopes), self._changed(slopes, self._moved_root))
+        T = self._moved(slopes.F, self.Q[:N] - np.matmul(self.gain, W))
+        P = np.matmul(T, transposed(T))
+        return np.moveaxis(P, 0, 1)

@@ -248,8 +248,8 @@ CHANGES = {
     "frozen-sandwich": Change(
         "states",
         "the covariance of a path at the root of eq. (11) is that of frozen slopes",
-        "self.inverse - np.matmul(self.gain, W)",
-        "self.inverse - 0 * np.matmul(self.gain, W)",
+        "self.Q[:N] - np.matmul(self.gain, W)",
+        "self.Q[:N] - 0 * np.matmul(self.gain, W)",
         "test_paths.py",
     ),
     "copies-unhalved": Change(
