@@ -67,8 +67,8 @@ class Analysis:
     says so."""
     tracks: pd.DataFrame
     """Errors of each state of a tracker, and of all: time `at` of each epoch, `median` and worst
-    tenth `q90` over all `trials`, `bound` at the truth, `posterior` and `posterior_smoothed`
-    Cramér-Rao bounds, and `nees_solved` over n of the `claims` with the ends of its limits."""
+    tenth `q90` over all `trials`, `bound` at the truth, and `nees_solved` over n of the `claims`
+    with the ends of its limits."""
 
     one_track: pd.DataFrame
     """One trial of each scenario: `truth`, `mean` and `deviation` of each tracker's states at each

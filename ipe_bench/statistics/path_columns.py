@@ -5,10 +5,10 @@ Epochs are dependent, so intervals and verdicts are those over trials.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from ipe_bench.statistics.sample import NIS, Sample
 from ipe_bench.statistics.statistic import ALL, Statistic
 from ipe_bench.statistics.verdicts import NO_VERDICT, WRONG
 from ipe_bench.trials.thresholds import FEW, FIT_LEVEL, GATE
-
-if TYPE_CHECKING:
-    from ipe_bench.runs.results import StoredCell
 
 NOT_WHITE = 0.05
 """Level of the test that innovations are white."""
@@ -147,7 +144,7 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
     errors = _errors(s, K)
     # Of each epoch: NEES and the trials that claim it; n variances of the bound, their ratio to
     # those of the filter, and the trials.
-    own = sum(_sums(s, s.group.cells, K, n + 4), np.zeros((K, n + 4)))
+    own = sum(_sums(s, K, n + 4), np.zeros((K, n + 4)))
     if not (K and len(errors)):
         return
     median, worst = quantiles(errors, np.array([0.5, 0.9]))
@@ -155,14 +152,11 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
     claims = own[:, 1]
     with np.errstate(all="ignore"):
         bound = np.sqrt(own[:, 2:-1] / own[:, -1:])
-    posterior = np.sqrt(_posterior(s, K))
     low, high = mean_limits(n, int(claims[0]))
     names = [*s.names, ALL]
     sizes = [*s.sizes, 1.0]
     units = [*(p["unit"] for p in s.parameters), ""]
     for i, name in enumerate(names):
-        # No posterior bound is of all states together.
-        filtered, smoothed = np.full((2, K), np.nan) if name == ALL else posterior[:, [i, n + i]].T
         yield {
             "parameter": name,
             "unit": units[i],
@@ -170,9 +164,6 @@ def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:
             "median": sizes[i] * median[:, i],
             "q90": sizes[i] * worst[:, i],
             "bound": sizes[i] * bound[:, i],
-            "smooths": bool(s.group.footer.get("smooths")),
-            "posterior": sizes[i] * filtered,
-            "posterior_smoothed": sizes[i] * smoothed,
             "nees_solved": np.where(claims >= FEW, nees / np.maximum(claims, 1) / n, np.nan),
             "nees_low_if_honest": low,
             "nees_high_if_honest": high,
@@ -191,24 +182,13 @@ def _errors(s: Sample, epochs: int) -> Array:
     return errors_in(np.concatenate([*texts, np.empty(0)]), epochs, s.n + 1)
 
 
-def _posterior(s: Sample, epochs: int) -> Array:
-    """Reads the posterior bounds (K, 2 n) of the first seed that has them; NaN if none has."""
-    truths = [truth for truth in s.group.truths if truth is not None]
-    for block in _sums(s, truths, epochs, 2 * s.n):
-        if np.isfinite(block).all():
-            return block
-    return np.full((epochs, 2 * s.n), np.nan)
-
-
-def _sums(s: Sample, cells: Sequence[StoredCell], epochs: int, columns: int) -> list[Array]:
+def _sums(s: Sample, epochs: int, columns: int) -> Iterator[Array]:
     """Reads the sums (K, columns) of each stored block."""
     from ipe_bench.trials.paths import unpacked
 
-    found = []
-    for cell in cells:
+    for cell in s.group.cells:
         stored = s.collection.load(cell, (), ("curves",))
-        found.extend(unpacked(stored.get("curves", np.empty(0)), epochs, columns))
-    return found
+        yield from unpacked(stored.get("curves", np.empty(0)), epochs, columns)
 
 
 def _error_statistic(name: str, title: str, told: str, q: float) -> Statistic:

@@ -199,25 +199,20 @@ class PathBlock:
         _ = self.variances
 
     def truth_columns(self) -> Columns:
-        """The scored states at the last epoch with their bounds, and the posterior bounds along the
-        whole path."""
+        """The scored states at the last epoch with their bounds."""
         model = self.scenario.assumed
         names = self.names
         at = self.scenario.scored
         posterior, error = np.full((2, len(self), len(at)), np.nan)
-        curves = np.full((2, model.epochs, len(at)), np.nan)
         if self.start == 0 and len(self) and not self.scenario.noise.real:
             drawn = self.scenario.draw(0, EXPECTED)
             # Without a density of paths there is no such bound.
             with np.errstate(all="ignore"), suppress(UserError, np.linalg.LinAlgError):
-                filtered, smoothed = posterior_bounds(model, drawn)
+                filtered, _ = posterior_bounds(model, drawn)
                 groups = [take(drawn, np.arange(i, EXPECTED, _PARTS)) for i in range(_PARTS)]
                 parts = [posterior_bounds(model, group)[0][-1] for group in groups]
                 posterior[0] = deviations(filtered[-1])[at]
                 error[0] = deviations(np.array(parts)).std(axis=0, ddof=1)[at] / np.sqrt(_PARTS)
-                curves = np.stack(
-                    [np.diagonal(P, axis1=1, axis2=2)[:, at] for P in (filtered, smoothed)]
-                )
         path = np.concatenate([self.paths.x[..., at], self.paths.z], axis=2)
         return {
             "trial": np.arange(self.start, self.start + len(self)),
@@ -225,7 +220,6 @@ class PathBlock:
             **by_parameter("bayes", names, np.sqrt(self.variances[:, -1])),
             **by_parameter("van_trees", names, posterior),
             **by_parameter("van_trees_error", names, error),
-            "curves": packed(len(self), list(curves)),
             COLUMN: texts(self.start, path),
         }
 
