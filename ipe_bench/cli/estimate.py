@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ipe_bench.basics.machine import library_versions
@@ -19,13 +19,13 @@ from ipe_bench.states.base import StateModel
 def estimate_command(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit
     passes."""
-    from ipe_bench.report.page.answer import FILES, NAME, Answer, store, write_page
-
     asked = single(
         "estimate", arguments, standard_words(arguments), run=(*of("run", "trials"), w.TRUTH)
     )
     if asked.spec.state_model is not None:
         return _track(asked, asked.spec.state_model)
+    from ipe_bench.report.page import answer as page
+
     question = asked.spec.question(asked.words.keys).checked()
     files = question.readings
     readings = [str(path.resolve()) for path in files] if isinstance(files, tuple) else None
@@ -39,13 +39,11 @@ def estimate_command(arguments: Sequence[str]) -> int:
         command["left_out"] = list(question.ignored)
     parts = [question.scenario, *question.estimators.values()]
     provenance = _provenance(asked, question.found.files, parts)
-    drawn = asked.spec.figures != "none"
-    with asked.folder(NAME, command, FILES) as folder:
-        answer = Answer.to(question, asked.title, "lines")
-        stored = store(folder, answer, command, provenance)
-    show(answer.parts())  # before what takes longest, so that who stops there has the numbers
-    say_files([stored, *write_page(folder, answer, provenance, figures=drawn)])
-    return 0 if answer.passes else 1
+
+    def answers() -> list[page.Answer]:
+        return [page.Answer.to(question, asked.title, "lines")]
+
+    return _answered(asked, page, command, provenance, answers)
 
 
 def standard_words(arguments: Sequence[str]) -> list[str]:
@@ -56,9 +54,8 @@ def standard_words(arguments: Sequence[str]) -> list[str]:
 
 
 def _track(asked: Single, model: StateModel) -> int:
-    """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where
-    no track passes."""
-    from ipe_bench.report.page.log import NAME, TABLE, LogAnswer, store, write_page
+    """Tracks the states by every chosen tracker; exit code 1 where no track passes."""
+    from ipe_bench.report.page import log as page
 
     spec = asked.spec
     find = spec.find or ()
@@ -74,15 +71,29 @@ def _track(asked: Single, model: StateModel) -> int:
     files = [log.file for log in question.logs if log.file]
     parts = [log.model for log in question.logs]
     provenance = _provenance(asked, files, [*parts, *question.trackers.values()])
-    drawn = spec.figures != "none"
-    with asked.folder(NAME, command, [TABLE]) as folder:
-        answers = LogAnswer.to(question, "lines")
-        stored = store(folder, answers, command, provenance)
-    for answer in answers:
+    return _answered(asked, page, command, provenance, lambda: page.LogAnswer.to(question, "lines"))
+
+
+def _answered(
+    asked: Single,
+    page: Any,
+    command: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+    answers: Callable[[], Sequence[Any]],
+) -> int:
+    """Answers in the folder of a command, prints tables and writes the files of a `page`; returns
+    the exit code."""
+    with asked.folder(page.NAME, command, page.FILES) as folder:
+        found = answers()
+        stored = page.store(folder, found, command, provenance)
+    files = [stored]
+    for answer in found:  # before what takes longest, so that who stops there has the numbers
         show(answer.parts())
-    pages = [write_page(folder, answer, provenance, figures=drawn) for answer in answers]
-    say_files([stored, *(file for files in pages for file in files)])
-    return 0 if all(answer.passes for answer in answers) else 1
+    for answer in found:
+        drawn = asked.spec.figures != "none"
+        files += page.write_page(folder, answer, provenance, figures=drawn)
+    say_files(files)
+    return 0 if all(answer.passes for answer in found) else 1
 
 
 def _provenance(

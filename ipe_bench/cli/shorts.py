@@ -26,7 +26,7 @@ from ipe_bench.cli import words as w
 from ipe_bench.cli.spec import KEYS
 from ipe_bench.measurements.arithmetic import parse
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.real.readings import SIGMA, TextTable, quantity, read_tables
+from ipe_bench.real.readings import SIGMA, quantity, read_tables
 from ipe_bench.report.words import enumerate_few
 
 _DATA = (".csv", ".tsv", ".txt", ".dat", ".parquet")
@@ -89,13 +89,13 @@ def read(command: str, words: Sequence[str]) -> Short:
         None if _VALUED.fullmatch(flag) else _kind(word)
         for flag, word in zip(before, words, strict=False)
     ]
-    files = [word for word, kind in zip(words, kinds, strict=True) if kind == "readings"]
+    bare = [word for word, kind in zip(words, kinds, strict=True) if kind == "readings"]
     models = [word for word, kind in zip(words, kinds, strict=True) if kind == "model"]
-    _refuse_columns(words, [*files, *(file for word in words for file in _typed_files(word))])
-    if not files and not models:
+    files = [*bare, *(file for word in words for file in _typed_files(word))]
+    _refuse_columns(words, files)
+    if not bare and not models:
         return Short(list(words))
-    files += [file for word in words for file in _typed_files(word)]
-    others = [word for word in words if word not in (*files, *models) and not _typed_files(word)]
+    others = [word for word in words if word not in (*bare, *models) and not _typed_files(word)]
     if not models:
         models = [word for word in others if _names_reading(word, files)][:1]
         others = [word for word in others if word not in models]
@@ -151,7 +151,7 @@ def _names_reading(word: str, files: Sequence[str]) -> bool:
         return False
     for file in files:
         _require_file(file)
-    return reading in _columns(read_tables([Path(files[0])])[0])
+    return reading in _columns(files[0])
 
 
 def _require_pair(
@@ -207,23 +207,19 @@ def _refuse_no_model(file: str, words: Sequence[str]) -> None:
             )
         reading = _reading_named(word)
         if reading:
-            columns = ", ".join(_columns(read_tables([Path(file)])[0]))
             raise UserError(
-                f"{word}: {file} has no column {reading}; its columns are {columns}: name one of"
-                " them before the ="
+                f"{word}: {file} has no column {reading}; its columns are"
+                f" {', '.join(_columns(file))}: name one of them before the ="
             )
     flags = [word for word in words if word.startswith("-")]
     bare = [word for word in words if "=" not in word and not word.startswith("~")]
     if bare and not flags:
         what = "is a folder" if Path(bare[0]).is_dir() else "is no model"
-        models = [one.name for one in Path().iterdir() if one.suffix in (".py", *_YAML)]
-        same = [name for name in models if Path(name).stem == bare[0]]
-        if same:
-            raise UserError(f"{bare[0]}: {what}; did you mean {same[0]}?")
-        raise UserError(
-            f"{bare[0]}: {what}; write a function's file, a formula in quotes or a YAML file in its"
-            " place"
-        )
+        remedy = "write a function's file, a formula in quotes or a YAML file in its place"
+        for one in Path().iterdir():
+            if one.stem == bare[0] and one.suffix in (".py", *_YAML):
+                remedy = f"did you mean {one.name}?"
+        raise UserError(f"{bare[0]}: {what}; {remedy}")
 
 
 def _shown(model: str) -> str:
@@ -244,8 +240,9 @@ def _require_file(name: str) -> None:
     raise UserError(f"{name}: {fault} here{did_you_mean(path.name, siblings)}")
 
 
-def _columns(table: TextTable) -> list[str]:
-    """Lists the columns of a table without their units."""
+def _columns(file: str) -> list[str]:
+    """Lists the columns of a file without their units."""
+    (table,) = read_tables([Path(file)])
     return [quantity(heading) for heading in table.heading]
 
 
@@ -287,9 +284,14 @@ class _Reader:
 
     def _free(self, taken: Sequence[str]) -> list[str]:
         """Lists the columns besides those that the model takes, sigma and those left out."""
-        (ignored,) = self._typed("ignore_columns") or [""]
-        known = {*taken, SIGMA, *(name.strip() for name in ignored.strip("[]").split(","))}
+        known = (*taken, SIGMA, *self._ignored)
         return [name for name in self.columns if name not in known]
+
+    @property
+    def _ignored(self) -> list[str]:
+        """Lists the columns that are left out."""
+        (typed,) = self._typed("ignore_columns") or [""]
+        return [name.strip() for name in typed.strip("[]").split(",") if name.strip()]
 
     def _typed(self, key: str) -> list[str]:
         """Returns the last value that was typed for a key."""
@@ -299,19 +301,17 @@ class _Reader:
     @cached_property
     def columns(self) -> list[str]:
         """Columns of the first file."""
-        return _columns(read_tables([Path(self.files[0])])[0])
+        return _columns(self.files[0])
 
     def _reading(self, what: str, taken: Sequence[str], usual: Sequence[str]) -> str:
         """Finds the column of the readings: the one that is typed, has a usual name, or is left."""
-        typed = self._typed("measurement.reading")
         free = self._free(taken)
-        named = [name for name in usual if name in free]
-        if typed or named:
-            reading = typed[0] if typed else named[0]
-            unused = [name for name in free if name != reading]
+        named = [*self._typed("measurement.reading"), *(name for name in usual if name in free)]
+        if named:
+            unused = [name for name in free if name != named[0]]
             if unused:
                 self._refuse_unused(what, unused, taken)
-            return reading
+            return named[0]
         if len(free) == 1:
             return free[0]
         if not free:
@@ -338,15 +338,14 @@ class _Reader:
         return f"ipe-bench {self.command} {' '.join(quoted)}"
 
     def _ignoring(self, columns: Sequence[str]) -> str:
-        (ignored,) = self._typed("ignore_columns") or [""]
-        before = [name.strip() for name in ignored.strip("[]").split(",") if name.strip()]
-        return f"ignore_columns=[{','.join([*before, *columns])}]"
+        return f"ignore_columns=[{','.join([*self._ignored, *columns])}]"
 
     def _refuse_unused(self, what: str, unused: Sequence[str], taken: Sequence[str]) -> None:
-        noun = "columns" if len(unused) > 1 else "column"
-        verb = "are" if len(unused) > 1 else "is"
+        said = f"columns {enumerate_few(unused)} are"
+        if len(unused) == 1:
+            said = f"column {unused[0]} is"
         raise UserError(
-            f"{self.files[0]}: {noun} {enumerate_few(unused)} {verb} not in {what}, which takes"
+            f"{self.files[0]}: {said} not in {what}, which takes"
             f" {enumerate_few(taken) or 'no column'}; correct the name, or leave out what is not"
             f" needed: {self._again(self._ignoring(unused))}"
         )

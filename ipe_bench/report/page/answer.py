@@ -754,8 +754,11 @@ def _turned(shift: float, near: float) -> str:
     return ""
 
 
-def store(folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any]) -> Path:
-    """Writes estimate.json, which has every estimate, and returns its path."""
+def store(
+    folder: Path, answers: Sequence[Answer], command: Any, provenance: Mapping[str, Any]
+) -> Path:
+    """Writes estimate.json, which has every estimate of the only answer, and returns its path."""
+    (answer,) = answers
     content = {**estimate_content(answer), **provenance}
     return write_result(folder, NAME, SCHEMA, command, content)
 

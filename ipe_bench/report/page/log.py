@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ipe_bench.report.progress import Shows
 
 NAME = "track"
-TABLE = "track.csv"
+FILES = ("track.csv",)
 SCHEMA = 1
 _NOTE = (
     "NIS / m: mean square of innovations in predicted standard deviations; smoothers: cost of the"
