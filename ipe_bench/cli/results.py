@@ -172,18 +172,9 @@ def show_report(
 
 
 def _print_table(rows: Sequence[Mapping[str, Any]], collection: Any) -> None:
-    from ipe_bench.report.tables.settings import Wording
-    from ipe_bench.report.tables.table import terminal
     from ipe_bench.report.tables.terminal import summary_tables
 
-    totals = []
-    if any(row["noise"] == "certified" for row in rows):
-        from ipe_bench.report.tables.reports import certified_tables
-
-        totals = [table for table in certified_tables(collection) if table.whole]
-    out = console()
-    wording = Wording.of(collection)
-    out.print(terminal(summary_tables(rows, totals, out.width, wording), out.width))
+    show(summary_tables(rows, collection, console().width))
     sys.stdout.flush()
 
 

@@ -14,7 +14,7 @@ from functools import cached_property
 from itertools import takewhile
 from typing import Any
 
-from ipe_bench.report.words import enumerate_few, percent, value_text
+from ipe_bench.report.words import agreeing, enumerate_few, from_to, percent, value_text
 from ipe_bench.statistics.intervals import LEVEL, clopper_pearson
 from ipe_bench.statistics.verdicts import OVERCONFIDENT
 from ipe_bench.trials.thresholds import HELD
@@ -161,8 +161,8 @@ class Finding:
             number = len(self.standings)
             is_counted = len(winners) > MOST_NAMES
             who = f"Only {who}" if is_counted else f"Of these {number}, only {who}"
-        verb = "succeeds" if len(winners) == 1 else "succeed"
         who = who.replace("all ", "All ", 1) if who.startswith("all ") else who
+        verb = agreeing("succeed", winners)
         return f"{who} {verb} {self._where(winners)} ({self._numbers(winners)})"
 
     def _where(self, winners: Sequence[Standing]) -> str:
@@ -249,8 +249,7 @@ class Finding:
                 if one.possible == reach:
                     phrases.setdefault(self._failing(one), []).append(one)
         for phrase, who in phrases.items():
-            verb = "fails" if len(who) == 1 else "fail"
-            yield f"{named(who, self.standings)} {verb} {phrase}".rstrip()
+            yield f"{named(who, self.standings)} {agreeing('fail', who)} {phrase}".rstrip()
 
     def _failing(self, one: Standing) -> str:
         """States where an estimator fails, and from where on its covariance is too small, if that
@@ -271,10 +270,10 @@ class Finding:
         ahead = [one for one in self.standings if one.seen == most]
         columns = slice(at, at + 1) if self.ascending else slice(None)
         share = seen([row for one in ahead for row in one.rows[columns] if row])
-        verb = "succeeds" if len(ahead) == 1 else "succeed"
         where = f"in {len(self.places)} {self._columns}"
         where = f"at error scale {self._scale(at)}" if self.ascending else where
-        told = f"{named(ahead, self.standings)} {verb} in {share} {where}"
+        who = named(ahead, self.standings)
+        told = f"{who} {agreeing('succeed', ahead)} in {share} {where}"
         if any(one.possible for one in self.standings):
             return f"Too few trials to rank; {told}"
         if len(self.places) == 1:
@@ -314,9 +313,6 @@ def seen(rows: Sequence[Row]) -> str:
     """States the successes that were seen, and the number of trials."""
     if not rows:
         return "no trial"
-    shares = sorted({row["success"] for row in rows})
-    share = " to ".join(dict.fromkeys(percent(end) for end in (shares[0], shares[-1])))
-    share = share.replace(" % to", " to")
-    numbers = sorted({int(row["trials"]) for row in rows})
-    trials = " to ".join(dict.fromkeys(f"{end:,}" for end in (numbers[0], numbers[-1])))
+    share = from_to((row["success"] for row in rows), percent).replace(" % to", " to")
+    trials = from_to(int(row["trials"]) for row in rows)
     return f"{share} of {trials} {'trial' if trials == '1' else 'trials'}"

@@ -16,8 +16,6 @@ from ipe_bench.report.figures import drawings
 from ipe_bench.report.formats import PAGE
 from ipe_bench.report.page.run import ReportResult, begin_report
 from ipe_bench.report.style import house_style
-from ipe_bench.report.tables.reports import certified_tables
-from ipe_bench.report.tables.settings import Wording
 from ipe_bench.report.tables.table import html, plain_text
 from ipe_bench.report.tables.terminal import summary_tables
 from ipe_bench.statistics.analysis import analyse
@@ -95,9 +93,7 @@ class Summary(pd.DataFrame):
     def _tables(self, width: int) -> list[Any]:
         rows: Any = self.to_dict("records")
         collection = collect([self._folder]) if self._needs_results else None
-        totals = certified_tables(collection) if collection else ()
-        wording = Wording.of(collection)
-        return summary_tables(rows, [one for one in totals if one.whole], width, wording)
+        return summary_tables(rows, collection, width)
 
     @property
     def _needs_results(self) -> bool:

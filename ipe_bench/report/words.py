@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from ipe_bench import __version__
@@ -42,6 +42,17 @@ def assignments(settings: Mapping[Any, str]) -> str:
 def counted(number: int, noun: str) -> str:
     """Words a number of things."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def agreeing(verb: str, who: Sequence[Any]) -> str:
+    """Words a verb of one or of several."""
+    return f"{verb}s" if len(who) == 1 else verb
+
+
+def from_to(numbers: Iterable[Any], show: Callable[[Any], str] = "{:,}".format) -> str:
+    """Words the least and the largest of numbers, or one where both are shown alike."""
+    ascending = sorted(numbers)
+    return " to ".join(dict.fromkeys(map(show, (ascending[0], ascending[-1]))))
 
 
 def enumerate_few(items: Sequence[str], most: int = 6) -> str:

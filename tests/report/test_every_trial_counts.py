@@ -127,7 +127,7 @@ def shown_tables(analysis: Analysis) -> Iterator[Table]:
     rows: Any = analysis.summary.to_dict("records")
     yield from all_tables(analysis)
     parts = [opening(analysis.totals.to_dict("records"))]
-    parts += [summary_tables(rows, [], width) for width in (80, 120)]
+    parts += [summary_tables(rows, None, width) for width in (80, 120)]
     yield from (part for some in parts for part in some if isinstance(part, Table))
 
 

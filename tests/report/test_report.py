@@ -196,7 +196,7 @@ def test_a_record_is_all_that_a_statistic_needs(result):
     page = result.report.read_text(encoding="utf-8")
     tables = {t.name: t for t in all_tables(analyse([result.report.parent]))}
     rows = result.summary.to_dict("records")
-    shown = "\n".join(shown_at(300, *summary_tables(rows, [], 300)))
+    shown = "\n".join(shown_at(300, *summary_tables(rows, None, 300)))
     for record in (*STATISTICS, *SCORES):
         assert DEFINITIONS[record.title] == record.definition
         assert str(escape(record.definition)) in page

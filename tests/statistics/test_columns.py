@@ -458,7 +458,7 @@ def test_a_cost_that_few_trials_carry_shows_its_mean(synthetic):
         synthetic.scenario(), "even", error, simulations=np.append(np.full(19, 100.0), 104.0)
     )
     rows: Any = summarize([synthetic.directory]).to_dict("records")
-    lines = plain_text(summary_tables(rows, (), 120), 120).splitlines()
+    lines = plain_text(summary_tables(rows, None, 120), 120).splitlines()
     costs = {
         name: next(line for line in lines if line.startswith(f" {name}"))
         for name in ("tailed", "even")

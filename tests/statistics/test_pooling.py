@@ -46,7 +46,7 @@ def headings(directory) -> tuple[list[str], list[tuple[str, ...]]]:
     analysis = analyse([directory])
     out = io.StringIO()
     Console(file=out, width=250).print(
-        terminal(summary_tables(analysis.summary.to_dict("records"), [], 250), 250)
+        terminal(summary_tables(analysis.summary.to_dict("records"), None, 250), 250)
     )
     titles = titles_in(out.getvalue())
     table = overview(analysis)

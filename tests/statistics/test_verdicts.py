@@ -48,7 +48,7 @@ def test_every_row_says_its_verdict_on_any_screen(synthetic):
         ("undecided", "undecided", "?"),
     ):
         told = [row | {"verdict": verdict} for row in rows]
-        wide, narrow = (plain_text(summary_tables(told, (), width), width) for width in (120, 80))
+        wide, narrow = (plain_text(summary_tables(told, None, width), width) for width in (120, 80))
         (row,) = (line for line in wide.splitlines() if line.lstrip().startswith("newton "))
         assert f" {word} " in row.replace(",", " ")
         (row,) = (line for line in narrow.splitlines() if line.lstrip().startswith("newton "))

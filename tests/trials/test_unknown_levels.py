@@ -54,7 +54,7 @@ def test_estimators_are_told_the_nominal_level_and_marked_so(tmp_path):
     total = frame[frame["parameter"] == "all"].iloc[0]
     assert total["success"] > 0.95
     with (shown := Console(width=200)).capture() as printed:
-        shown.print(terminal(summary_tables(frame.to_dict("records"), [], 120), 120))
+        shown.print(terminal(summary_tables(frame.to_dict("records"), None, 120), 120))
     assert "every estimator here assumes R with the true levels" in printed.get()
 
 

@@ -274,9 +274,8 @@ def _heading(row: dict[str, Any]) -> str:
     who = row["first"]
     if row["second"] != who:
         who = f"{who}, then {row['second']}"
-    trials = "1 trial" if row["trials"] == 1 else f"{row['trials']} trials"
     how = "" if row["matched_by"] == "trial" else " of other seeds, matched in their order"
-    return f"{comparison_title(row)}: {who}; {trials}{how}"
+    return f"{comparison_title(row)}: {who}; {counted(row['trials'], 'trial')}{how}"
 
 
 def _cells(row: dict[str, Any], interval: str) -> dict[str, str]:

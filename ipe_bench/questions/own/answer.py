@@ -14,7 +14,7 @@ from ipe_bench.questions.own.maths import Claim, Own, Point
 from ipe_bench.real.profiles import CONFIDENCE
 from ipe_bench.report.page.writer import write_files
 from ipe_bench.report.tables.table import Part, Strong, Table, texts, words
-from ipe_bench.report.words import compact, duration
+from ipe_bench.report.words import agreeing, compact, duration
 
 NAME = "own"
 TABLE = "own.csv"
@@ -166,8 +166,8 @@ def _told_a_prior(own: Own, point: Point) -> Iterator[str]:
     for told in dict.fromkeys(one.told for one in unranked):
         claims = [one for one in unranked if one.told == told]
         labels = ", ".join(one.label for one in claims)
-        verb = "finds" if len(claims) == 1 else "find"
-        yield f"with the prior {told}, {_missing(own, claims) or f'{labels} {verb} the best fit'}"
+        found = f"{labels} {agreeing('find', claims)} the best fit"
+        yield f"with the prior {told}, {_missing(own, claims) or found}"
 
 
 def _dearer(own: Own, point: Point) -> Iterator[str]:

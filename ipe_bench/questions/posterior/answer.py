@@ -167,7 +167,7 @@ def finding(found: Sequence[Reference]) -> str:
     for label in settled[0].divergences:
         words = [adequate_word(one.divergences[label], one.posterior) for one in settled]
         by_count.setdefault(words.count("yes"), []).append(label)
-    trials = "1 trial" if len(settled) == 1 else f"{len(settled)} trials"
+    trials = counted(len(settled), "trial")
     listed = [
         f"{enumerate_few(by_count[count])} in {count} of {trials}"
         for count in sorted(by_count, reverse=True)

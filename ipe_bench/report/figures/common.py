@@ -219,17 +219,11 @@ def title(ax: Axes, words: str) -> None:
 
 
 def titles(axes: Iterable[Axes], words: Sequence[str]) -> None:
-    """Sets the titles of panels, cut at their ends, or at their starts if only ends tell them
-    apart."""
+    """Sets the titles of panels, shortened so that they are told apart."""
     panels = list(axes)[: len(words)]
+    short = texts(words, min(map(title_letters, panels)))
     for ax, text in zip(panels, words, strict=True):
-        title(ax, text)
-    if len({ax.get_title() for ax in panels}) == len(set(words)):
-        return
-    for ax, text in zip(panels, words, strict=True):
-        most = title_letters(ax)
-        end = text if len(text) <= most else f"…{text[1 - most :]}"
-        ax.set_title(end.replace("$", r"\$"))
+        ax.set_title(short[text])
 
 
 def title_letters(ax: Axes) -> int:

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 from scipy.special import gammainc
 
-from ipe_bench.basics.linalg import Array
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.headline import chosen
@@ -65,7 +64,9 @@ def draw(view: View) -> Iterator[Drawing]:
     common.legend(fig, axes, {} if named else look)
     over = "over error scales" if several else f"at error scale {value_text(start)}"
     title = f"Success, error and reported covariance {over}"
-    said = _start_in_words(view, start) if start > view.scales[0] else ""
+    said = ""
+    if start > view.scales[0]:
+        said = f"Up to error scale {value_text(start)} all are alike: the axis starts there."
     told = f"{BARS}{_ALONG}" if view.moving else BARS
     left_out = f"Not drawn: {enumerate_few(hidden, 4)}." if hidden else ""
     yield view.drawing(fig, "headline", title, said, told, _solved_in_words(rows), left_out)
@@ -96,9 +97,10 @@ def _parting(view: View, totals: pd.DataFrame) -> float:
     for scale in view.scales:
         here = totals[totals["error_scale"] == scale]
         with np.errstate(all="ignore"):
-            spreads = [_spread(here[name]) for name in ("error_median", "nees_mean")]
+            judged = here[["error_median", "nees_mean"]]
+            spreads = judged.max() / judged.min()
         # Of a statistic that no estimator has, the spread is NaN.
-        close = not any(spread > 1 + _APART for spread in spreads)
+        close = not (spreads > 1 + _APART).any()
         complete = len(here) == whole
         alike.append(complete and here["success"].min() >= _ALL and close)
     if all(alike):
@@ -106,14 +108,6 @@ def _parting(view: View, totals: pd.DataFrame) -> float:
     last_alike = max(alike.index(False) - 1, 0)
     third_last = max(len(alike) - 3, 0)
     return view.scales[min(last_alike, third_last)]
-
-
-def _spread(values: pd.Series[Any]) -> float:
-    return values.max() / values.min()
-
-
-def _start_in_words(view: View, start: float) -> str:
-    return f"Up to error scale {value_text(start)} all are alike: the axis starts there."
 
 
 def _solved_in_words(rows: pd.DataFrame) -> str:
@@ -181,7 +175,8 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
         if not view.moving:  # the errors of an epoch and of the next are dependent
             at = np.geomspace(low, high, 200)
             chi = gammainc(view.n / 2, view.n * at**2 / 2)
-            _efficient(ax, at, chi)
+            bound: Any = {"color": BOUND_COLOR, "linestyle": BOUND_DASH, "linewidth": 1.0}
+            ax.plot(at, chi, label="efficient estimator", zorder=1, **bound)
         common.lines(ax, part, "error", "probability", look)
         ax.set_xscale("log")
         ax.set_xlim(low, high)
@@ -191,7 +186,7 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
     top = view.scales[-1]
     last = rows[(rows["error_scale"] == top) & (rows["probability"] == 0.99)]
     ends = last[["estimator", "error"]].to_numpy()
-    seen = [f"{label} {_up_to(value, most)}" for label, value in ends]
+    seen = [f"{label} {brief(value) if value <= most else f'>{most:g}'}" for label, value in ends]
     yield view.drawing(
         fig,
         "distributions",
@@ -200,15 +195,6 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
         common.left_out(view.scales, panels),
         f"99 % quantile at scale {value_text(top)}: {enumerate_few(seen, 2)}.",
     )
-
-
-def _efficient(ax: Any, at: Array, probability: Array) -> None:
-    style: Any = {"color": BOUND_COLOR, "linestyle": BOUND_DASH, "linewidth": 1.0, "zorder": 1}
-    ax.plot(at, probability, label="efficient estimator", **style)
-
-
-def _up_to(value: float, most: float) -> str:
-    return brief(value) if value <= most else f">{most:g}"
 
 
 def draw_calibration(view: View) -> Iterator[Drawing]:

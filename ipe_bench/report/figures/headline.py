@@ -18,7 +18,7 @@ from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.finding import Finding
 from ipe_bench.report.style import DARK, REFERENCE, WHITE
 from ipe_bench.report.tables.matrix import SUCCESS
-from ipe_bench.report.words import enumerate_few, value_text
+from ipe_bench.report.words import enumerate_few, from_to, value_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -208,12 +208,12 @@ def _title(figure: Canvas, rows: pd.DataFrame, soft: str) -> None:
     # The picture may show some of the estimators alone.
     found = re.sub(r"^(?:Of these \d+, only|Only) ", "", found)
     lines = textwrap.wrap(found, _LONGEST)[:2]
-    size = _TITLE if len(lines) == 1 else _TITLE - 3
+    alone = len(lines) == 1
+    size = _TITLE if alone else _TITLE - 3
+    top = 0.965 if alone else 0.985
     heading: Any = {"fontsize": size, "fontweight": "bold", "va": "top", "linespacing": 1.1}
-    top = 0.965 if len(lines) == 1 else 0.985
     figure.text(0.02, top, "\n".join(lines).replace("$", r"\$"), **heading)
-    trials = sorted({int(number) for number in rows["trials"]})
-    number = " to ".join(f"{end:,}" for end in dict.fromkeys((trials[0], trials[-1])))
+    number = from_to(map(int, rows["trials"]))
     told = f"successful trials, % of {number} (bars: 95 % intervals)"
     figure.text(0.02, 0.85, told, fontsize=_LETTERS, color=soft, va="center")
 

@@ -12,7 +12,7 @@ from ipe_bench.report.page.headline import about, headline, success, task
 from ipe_bench.report.page.writer import Page, digests
 from ipe_bench.report.tables.matrix import MATRIX, SUCCESS, Matrix
 from ipe_bench.report.tables.table import Part, Strong, Table, environment, words
-from ipe_bench.report.words import counted, public
+from ipe_bench.report.words import counted, from_to, public
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.statistics.comparisons import EXACT, TIE
 from ipe_bench.statistics.records import SCORES, STATISTICS
@@ -101,10 +101,9 @@ def _asked(analysis: Analysis) -> list[str]:
     for column, noun in (("estimator", "estimator"), ("error_scale", "error scale")):
         if column in totals and len(totals):
             numbers.append(counted(totals[column].nunique(), noun))
-    trials = sorted(set(totals["trials"])) if len(totals) else []
-    if trials:
-        each = " to ".join(f"{end:,}" for end in dict.fromkeys((trials[0], trials[-1])))
-        numbers.append(f"{each} {'trial' if trials[-1] == 1 else 'trials'} each")
+    if len(totals):
+        noun = "trial" if totals["trials"].max() == 1 else "trials"
+        numbers.append(f"{from_to(totals['trials'])} {noun} each")
     return [*numbers, *filter(None, [task(analysis.collection.groups)])]
 
 

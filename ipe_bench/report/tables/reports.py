@@ -183,11 +183,14 @@ def contraction(analysis: Analysis) -> Table | None:
     if rows.empty:
         return None
     columns = head(analysis, rows)
+    ends = (
+        ("median", ", median", short),
+        ("max", ", largest", short),
+        ("below_1", " below 1", percent),
+    )
     for name, title in (("K", "K"), ("norm", "infinity norm"), ("radius", "spectral radius")):
-        stored = f"contraction_{name}"
-        columns.append(column(f"{title}, median", rows[f"{stored}_median"], short))
-        columns.append(column(f"{title}, largest", rows[f"{stored}_max"], short))
-        columns.append(column(f"{title} below 1", rows[f"{stored}_below_1"], percent))
+        for end, said, show in ends:
+            columns.append(column(f"{title}{said}", rows[f"contraction_{name}_{end}"], show))
     caption = (
         "Of g' = I - H⁺J at the truth, over all trials. K of eq. (15), or the infinity norm, below"
         " 1 in a whole neighbourhood is sufficient for fixed-point iteration to converge there;"
@@ -206,11 +209,14 @@ def comparisons(analysis: Analysis) -> Table | None:
     columns = head(analysis, rows)
     columns += _texts(rows, "first", "second")
     columns += _counts(rows, "trials", "wins", "ties", "losses")
-    columns.append(column("median difference", rows["median_difference"], short))
-    columns.append(column("p of error", rows["p_error"], p_value))
-    columns.append(column("first alone", rows["only_first"], str))
-    columns.append(column("second alone", rows["only_second"], str))
-    columns.append(column("p of success", rows["p_success"], p_value))
+    for title, name, show in (
+        ("median difference", "median_difference", short),
+        ("p of error", "p_error", p_value),
+        ("first alone", "only_first", str),
+        ("second alone", "only_second", str),
+        ("p of success", "p_success", p_value),
+    ):
+        columns.append(column(title, rows[name], show))
     columns.append(words("finding", closer))
     caption = (
         "Over the trials that both have. First alone and second alone count trials in which only"

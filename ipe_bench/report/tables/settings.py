@@ -85,10 +85,6 @@ class Wording:
         return f"{assignments({column: value})} {unit}".rstrip()
 
 
-PLAIN = Wording({}, frozenset())
-"""Words settings by rows alone."""
-
-
 def _most_frequent(texts: Sequence[str]) -> str:
     """Returns the first, in alphabetical order, of those that occur most often."""
     counts = Counter(sorted(texts))

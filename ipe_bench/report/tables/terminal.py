@@ -4,14 +4,15 @@ names."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection as Keys
 from dataclasses import replace
 from itertools import repeat
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ipe_bench.report.finding import FAILS, Finding
 from ipe_bench.report.tables.matrix import opening
-from ipe_bench.report.tables.settings import PLAIN, Wording
+from ipe_bench.report.tables.settings import Wording
 from ipe_bench.report.tables.table import (
     Column,
     Legend,
@@ -26,6 +27,7 @@ from ipe_bench.report.tables.table import (
 from ipe_bench.report.words import (
     brief,
     cost,
+    counted,
     duration,
     ends_in_percent,
     p_value,
@@ -41,6 +43,9 @@ from ipe_bench.statistics.registry import all_statistics, summary_columns
 from ipe_bench.statistics.statistic import ALL, BEST, Kind, Statistic, Where
 from ipe_bench.statistics.verdicts import CONSISTENT, NOT_REFUTED, VERDICTS, shown, sign_of
 from ipe_bench.trials.thresholds import FEW
+
+if TYPE_CHECKING:
+    from ipe_bench.statistics.collect import Collection
 
 _MOST_LINES = 46
 """Lines that a terminal shows of several settings, most of them of matrices."""
@@ -77,7 +82,7 @@ _NAMED = ("measurement", "noise")
 """Columns that head every table."""
 
 
-def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[str, ...]:
+def overview_notes(noises: Keys[str], *, narrow: bool = False) -> tuple[str, ...]:
     """Explains the columns of the overview, and what estimators assume about these noises."""
     reference = "the linearised filter" if set(noises) == {"model"} else "the bound"
     failed = "" if narrow else _FAILED
@@ -91,14 +96,13 @@ def overview_notes(noises: Collection[str], *, narrow: bool = False) -> tuple[st
 
 
 def summary_tables(
-    listed: Sequence[Mapping[str, Any]],
-    totals: Sequence[Table],
-    width: int,
-    wording: Wording = PLAIN,
+    listed: Sequence[Mapping[str, Any]], collection: Collection | None, width: int
 ) -> list[Part]:
     """Returns a table per setting (measurement, noise, differing options), after the totals of
-    certified runs."""
+    certified runs; without a `collection` their words are made of the rows alone."""
     rows = [row for row in listed if row["parameter"] == ALL]
+    wording = Wording.of(collection)
+    totals = _totals(rows, collection)
     if totals:
         # Models whose own readings are certified, without being of a collection, have no totals.
         rows = [row for row in rows if row["noise"] != "certified"]
@@ -126,6 +130,15 @@ def summary_tables(
             " have all."
         )
     return parts or ["no trials yet"]
+
+
+def _totals(rows: Sequence[Mapping[str, Any]], collection: Collection | None) -> list[Table]:
+    """Returns the tables of certified runs that a terminal shows."""
+    if collection is None or all(row["noise"] != "certified" for row in rows):
+        return []
+    from ipe_bench.report.tables.reports import certified_tables  # which loads pandas
+
+    return [table for table in certified_tables(collection) if table.whole]
 
 
 def _columns_of_settings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -198,8 +211,7 @@ def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table
     if len(counts) > 1:
         columns.append(column("trials", [row["trials"] for row in rows], str))
     else:
-        trials = "1 trial" if counts[0] == 1 else f"{counts[0]} trials"
-        title = f"{title}: {trials} per row"
+        title = f"{title}: {counted(counts[0], 'trial')} per row"
     title += f" at error scale {value_text(rows[0]['error_scale'])}"
     return Table("summary", title, "", columns, whole="summary.csv")
 
