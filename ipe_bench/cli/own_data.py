@@ -17,6 +17,7 @@ from ipe_bench.plugins import standard
 from ipe_bench.questions.own.maths import require_answer
 from ipe_bench.real.estimation import Question
 from ipe_bench.real.fits import Fit
+from ipe_bench.report.words import from_to
 
 NEAR = 0.1
 """Error scale about an estimate, unless another is given."""
@@ -86,8 +87,5 @@ def like_these(
 
 def _level(fit: Fit) -> str:
     deviations = fit.assumed.R.deviations
-    low = float(deviations.min())
-    high = float(deviations.max())
-    if low == high:
-        return f"standard deviation {low:.3g}"
-    return f"standard deviations {low:.3g} to {high:.3g}"
+    noun = "standard deviation" if np.ptp(deviations) == 0.0 else "standard deviations"
+    return f"{noun} {from_to(deviations.tolist(), '{:.3g}'.format)}"

@@ -8,14 +8,14 @@ estimators start where the user does. The prior of an estimator is no part of th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, deviations
+from ipe_bench.basics.linalg import Array, Mask, deviations
 from ipe_bench.basics.streams import numbered
 from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement
@@ -26,6 +26,7 @@ from ipe_bench.real.estimation import Question
 from ipe_bench.real.examination import Examination
 from ipe_bench.real.fits import Fit, scaled
 from ipe_bench.real.profiles import CONFIDENCE, half_width
+from ipe_bench.report.words import from_to
 from ipe_bench.statistics.intervals import clopper_pearson
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
@@ -59,6 +60,18 @@ class Claim:
     """Median evaluations of the model, a Jacobian counting as many as it costs."""
     seconds: float
     """Mean time of a data set."""
+
+    @classmethod
+    def of(
+        cls, label: str, told: str, found: Mask, ratio: Array, names: Sequence[str], **spent: float
+    ) -> Claim:
+        """Counts the trials (trials,) in which an estimator found what it should, and those in
+        which errors over half-widths (trials, n) are at most 1."""
+        inside = (ratio <= 1.0).sum(axis=0)
+        worst = int(inside.argmin())
+        factor = float(np.quantile(ratio[:, worst], CONFIDENCE, method="higher"))
+        counts = (len(ratio), int(np.sum(found)), tuple(inside.tolist()))
+        return cls(label, told, *counts, names[worst], factor, **spent)
 
     @property
     def finds(self) -> float:
@@ -158,7 +171,6 @@ def own(
     estimators: Mapping[str, Estimator],
     trials: int,
     seed: int = 0,
-    watch: Callable[[str], object] = str,
 ) -> Own:
     """Simulates readings like those of a question, which names one estimator that answers it, and
     lets `estimators` answer them.
@@ -183,12 +195,12 @@ def own(
     truths = _truths(fit, examination, problem)
     for truth in truths[:MOST_POINTS]:
         z = _drawn(fit, problem, truth.x, trials, seed)
-        claims = _claims(fit, problem, kept, truth, z, watch)
+        claims = _claims(fit, problem, kept, truth, z)
         values = problem.measurement.physical(truth.x[None])[0].tolist()
         names = [p.name for p in problem.measurement.physical_parameters]
         points.append(Point(dict(zip(names, values, strict=True)), claims))
     more = len(truths) - len(points)
-    noise = _noise_in_words(problem)
+    noise = from_to(problem.R.deviations.tolist(), "{:.3g}".format)
     return Own(trials, points, noise, question.has_prior, left_out, further=more)
 
 
@@ -200,13 +212,6 @@ def _at_least(fit: Fit, examination: Examination | None) -> Problem:
         return problem
     least = min(examination.minima[0].chi_square, examination.chi_square)
     return scaled(problem, float(np.sqrt(least / fit.degrees_of_freedom)))
-
-
-def _noise_in_words(problem: Problem) -> str:
-    deviation = problem.R.deviations
-    low = float(deviation.min())
-    high = float(deviation.max())
-    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
 
 
 def _truths(fit: Fit, examination: Examination | None, problem: Problem) -> list[_Truth]:
@@ -256,14 +261,12 @@ def _claims(
     estimators: Mapping[str, Estimator],
     truth: _Truth,
     z: Array,
-    watch: Callable[[str], object],
 ) -> list[Claim]:
     """Lets each estimator answer readings z (trials, m) of a truth, those with a prior once for
     each that they are told."""
     runs: list[tuple[str, str, Estimates]] = []
     for label, one in estimators.items():
         for told, known in _tellings(problem, one).items():
-            watch(label)
             runs.append((label, told, estimate_safely(one, known, z)))
     model = problem.measurement
     curves = [_curves(model, each.x, z) for _, _, each in runs]
@@ -352,16 +355,7 @@ def _claim(
     # An answer at a copy, such as one of another sign, is held against that.
     closest = ratios.max(axis=2).argmin(axis=0)
     ratio = ratios[closest, np.arange(len(width))]
-    inside = (ratio <= 1.0).sum(axis=0)
-    worst = int(inside.argmin())
-    return Claim(
-        label,
-        told,
-        trials=len(width),
-        found=int(near.sum()),
-        inside=tuple(inside.tolist()),
-        worst=model.physical_parameters[worst].name,
-        factor=float(np.quantile(ratio[:, worst], CONFIDENCE, method="higher")),
-        cost=float(np.median(cost(each.simulations, each.jacobians, model.jacobian_cost))),
-        seconds=float(np.mean(each.seconds)),
-    )
+    names = [p.name for p in model.physical_parameters]
+    spent = np.median(cost(each.simulations, each.jacobians, model.jacobian_cost))
+    seconds = float(np.mean(each.seconds))
+    return Claim.of(label, told, near, ratio, names, cost=float(spent), seconds=seconds)
