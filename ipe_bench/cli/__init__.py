@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, refuse_unknown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -78,8 +78,7 @@ def places_and_keys(
     found: dict[str, Any] = {}
     for word in (word for word in words if word not in places):
         key, _, text = word.partition("=")
-        if key not in kinds:
-            raise UserError(f"{command}: {word}: {unknown(key, kinds, 'key')}")
+        refuse_unknown(f"{command}: {word}", key, kinds, "key")
         if key in found:
             raise UserError(f"{command}: {word}: {key} is given twice")
         if not text:

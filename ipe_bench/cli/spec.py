@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import cloudpickle
 
 from ipe_bench.basics.definitions import pinned
-from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.basics.errors import UserError, describe_exception, refuse_unknown, unknown
 from ipe_bench.basics.options import Component, Count, Positive, Quantile, Whole
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
@@ -112,16 +112,12 @@ class Spec(Component):
 
         use_statistics()
         numbers = [one for one in (*all_statistics(), *SCORES) if one.kind != "word"]
-        columns = frame_columns(numbers)
         if not label:
             example = f"{next(iter(self.estimators), 'LABEL')}.capped_error"
             raise UserError(f"objective={self.objective}: write LABEL.COLUMN, such as {example}")
-        for name, known, noun in (
-            (label, self.estimators, "estimator"),
-            (column, columns, "column"),
-        ):
-            if name not in known:
-                raise UserError(f"objective={self.objective}: {unknown(name, known, noun)}")
+        key = f"objective={self.objective}"
+        refuse_unknown(key, label, self.estimators, "estimator")
+        refuse_unknown(key, column, frame_columns(numbers), "column")
 
     @property
     def aim(self) -> tuple[str, str]:
@@ -205,9 +201,8 @@ DEFAULTS |= {"estimators": {}, "trackers": {}}
 
 def spec(config: Mapping[Any, Any]) -> Spec:
     """Constructs the job that a composed config describes."""
-    for key in config:
-        if key not in KEYS:
-            raise UserError(f"{key}: {unknown(str(key), KEYS, 'key')}")
+    for key in map(str, config):
+        refuse_unknown(key, key, KEYS, "key")
     for key in PARTS:
         if key not in OPTIONAL or config.get(key) is not None:
             _require_part(key, config.get(key))

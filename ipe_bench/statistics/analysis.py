@@ -31,6 +31,11 @@ PROBABILITIES = np.unique(
     np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]])
 )
 """Probabilities at which the distribution of errors is tabulated."""
+_OF_ROWS = (
+    *("endings", "scores", "distributions", "convergence", "calibration", "contraction"),
+    *("tracks", "one_track"),
+)
+"""Frames of an analysis that are made of rows."""
 MESSAGES = 20
 """Different messages of one estimator on one scenario that are listed one by one."""
 
@@ -219,20 +224,12 @@ class Begun:
         pairs = []
         for where, outcomes in self._compared:
             pairs += [where | pair for pair in compare_pairs(outcomes)]
-        rows = self._rows
         return Analysis(
             collection=self.collection,
             summary=to_frame(self.summary),
-            endings=pd.DataFrame(rows["endings"]),
             # Corrected over all scenarios: a sweep asks all its questions at once.
             pairs=pd.DataFrame(corrected(pairs)),
-            scores=pd.DataFrame(rows["scores"]),
-            distributions=_joined(rows["distributions"]),
-            convergence=_joined(rows["convergence"]),
-            calibration=_joined(rows["calibration"]),
-            contraction=pd.DataFrame(rows["contraction"]),
-            tracks=_joined(rows["tracks"]),
-            one_track=_joined(rows["one_track"]),
+            **{name: _joined(self._rows[name]) for name in _OF_ROWS},
         )
 
 
@@ -242,8 +239,11 @@ def _joined(parts: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
     if not parts:
         return pd.DataFrame()
+    frame = pd.DataFrame(list(parts))
     arrays = [name for name, value in parts[0].items() if isinstance(value, np.ndarray)]
-    return pd.DataFrame(list(parts)).explode(arrays, ignore_index=True).infer_objects()
+    if not arrays:
+        return frame
+    return frame.explode(arrays, ignore_index=True).infer_objects()
 
 
 def _shared(sample: Sample) -> dict[str, Any]:

@@ -411,12 +411,13 @@ def _verdicts(answer: Answer) -> Table:
     ]
     if any(one.level is None for one in fits):
         squares = [_number(one.chi_square) if one.level is None else "-" for one in fits]
-        columns.append(texts("p", [_fit_p(one.p_value) for one in fits]))
-        columns.append(texts("chi2", squares))
-    columns.append(texts("dof", [str(one.degrees_of_freedom) for one in fits]))
-    columns.append(texts("white p", [p_value(one.white_p, LEAST_P) for one in fits]))
-    columns.append(texts("outliers", [str(int(one.outliers.sum())) for one in fits]))
-    columns.append(texts("deviation", [_number(one.residual_deviation) for one in fits]))
+        columns += [texts("p", [_fit_p(one.p_value) for one in fits]), texts("chi2", squares)]
+    columns += [
+        texts("dof", [str(one.degrees_of_freedom) for one in fits]),
+        texts("white p", [p_value(one.white_p, LEAST_P) for one in fits]),
+        texts("outliers", [str(int(one.outliers.sum())) for one in fits]),
+        texts("deviation", [_number(one.residual_deviation) for one in fits]),
+    ]
     return Table("verdicts", "Does the model fit?", "", columns, notes=list(_notes(answer)))
 
 

@@ -63,10 +63,11 @@ def render_page(
         ("tables", "Tables", folded),
     ]
     sections += [(f"section-{one.name}", one.title, one.parts) for one in written]
-    appendix = [table for table in tables if table.appendix]
-    sections.append(("appendix", "Further tables", appendix))
-    sections.append(("provenance", "Configuration and provenance", _provenance(runs, older)))
-    sections.append(("definitions", "Definitions", [_definitions()]))
+    sections += [
+        ("appendix", "Further tables", [table for table in tables if table.appendix]),
+        ("provenance", "Configuration and provenance", _provenance(runs, older)),
+        ("definitions", "Definitions", [_definitions()]),
+    ]
     names = ", ".join(folder.resolve().name or str(folder) for folder in collection.directories)
     title = str(answer.pop(0)).removesuffix(".") if isinstance(answer[0], Strong) else names
     named = [names] if names and title != names else []

@@ -14,6 +14,7 @@ from ipe_bench.report.tables.terminal import (
     leading,
     overview_columns,
     overview_notes,
+    shown_in,
     statistics,
 )
 from ipe_bench.report.words import enumerate_few, p_value, percent, short, value_text, varying
@@ -21,7 +22,6 @@ from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_averages, certified_table, published_table
 from ipe_bench.statistics.collect import Collection
 from ipe_bench.statistics.records import SCORES
-from ipe_bench.statistics.registry import all_statistics
 from ipe_bench.statistics.statistic import ALL, Where, frame_columns
 
 _OPEN = (
@@ -154,8 +154,7 @@ def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table |
         return None
     told: Any = rows.to_dict("records")
     columns = [*head(analysis, rows), *_texts(rows, *names), *statistics(where, told)]
-    records = [record for record in (*all_statistics(), *SCORES) if where in record.where]
-    stored = [name for record in records for name in record.columns]
+    stored = frame_columns(shown_in(where))
     data = rows[[*analysis.setting_columns, "error_scale", *names, *stored]]
     return Table(where, title, caption, columns, data)
 

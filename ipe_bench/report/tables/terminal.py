@@ -60,6 +60,8 @@ _LEGEND = (
     " median (mean where it differs); time: mean of a trial. More: ipe-bench list statistic."
 )
 _FAILED = "; failed: known / undetected, %"
+_WIDE = ("failed", "verdict")
+"""Columns that a narrow screen leaves out."""
 _SPELT_OUT = (
     "; verdict: is the reported covariance right? Within: the largest factor of the variance that"
     " is not excluded"
@@ -249,20 +251,19 @@ def overview_columns(
         sign = sign_of(row["verdict"]) if narrow else _of_claims(row)
         return f"{brief(row['nees_mean'])} {sign}".strip()
 
-    columns = [words("estimator", [row["estimator"] for row in rows], best)]
-    columns.append(words("given", [row["given"] for row in rows]))
-    columns.append(numbers("success", "success", _success, best))
-    if not narrow:
-        columns.append(numbers("failed", "failed_silent", _failed))
-    columns.append(numbers("error", "error_median", error))
-    efficiency = "eff." if narrow else "efficiency"
-    columns.append(numbers(efficiency, "efficiency_capped", _efficiency))
-    columns.append(numbers("NEES", "nees_mean", nees))
-    if not narrow:
-        columns.append(words("verdict", map(_verdict, rows)))
-    columns.append(numbers("cost", "simulations_median", _cost))
-    columns.append(numbers("time", "time_mean_s", _time))
-    return columns
+    columns = [
+        words("estimator", [row["estimator"] for row in rows], best),
+        words("given", [row["given"] for row in rows]),
+        numbers("success", "success", _success, best),
+        numbers("failed", "failed_silent", _failed),
+        numbers("error", "error_median", error),
+        numbers("eff." if narrow else "efficiency", "efficiency_capped", _efficiency),
+        numbers("NEES", "nees_mean", nees),
+        words("verdict", map(_verdict, rows)),
+        numbers("cost", "simulations_median", _cost),
+        numbers("time", "time_mean_s", _time),
+    ]
+    return [one for one in columns if not narrow or one.title not in _WIDE]
 
 
 def _success(row: Mapping[str, Any]) -> str:
@@ -313,8 +314,8 @@ def _time(row: Mapping[str, Any]) -> str:
 def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
     """Returns the columns of the statistics that are shown in that table."""
     columns: list[Column] = []
-    for record in (*all_statistics(), *SCORES):
-        if where not in record.where or not reported(record, rows):
+    for record in shown_in(where):
+        if not reported(record, rows):
             continue
         title = record.titles.get(where, record.title)
         texts = [_shown(record, where, row) for row in rows]
@@ -330,6 +331,11 @@ def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
             show = _shower(record.kind, where)
             columns.append(interval(record.limits_titles[where], low, high, show))
     return columns
+
+
+def shown_in(where: Where) -> list[Statistic]:
+    """Returns the statistics that name a table."""
+    return [record for record in (*all_statistics(), *SCORES) if where in record.where]
 
 
 def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
