@@ -142,20 +142,26 @@ def validate(
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         if isinstance(scenario, StateScenario):
-            mistakes += _with_trackers(scenario, estimators, untried)
+            what = "estimates constants; a state model takes trackers"
+            others = _others(estimators, Tracker, what)
+            mistakes += others or _with_trackers(scenario, estimators, untried)
         else:
-            mistakes += _with_estimators(scenario, estimators, untried)
+            what = "tracks states that move; a measurement model takes estimators"
+            others = _others(estimators, Estimator, what)
+            mistakes += others or _with_estimators(scenario, estimators, untried)
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
+
+
+def _others(estimators: Mapping[str, Any], kind: type, what: str) -> list[str]:
+    """Refuses what is not of the kind that a scenario takes."""
+    labels = [label for label, one in estimators.items() if not isinstance(one, kind)]
+    return [f"estimators.{label}: {what}" for label in labels]
 
 
 def _with_trackers(
     scenario: StateScenario, trackers: Mapping[str, Any], untried: Sequence[AnyScenario] | None
 ) -> list[str]:
-    what = "estimates constants; a state model takes trackers"
-    other = [label for label, one in trackers.items() if not isinstance(one, Tracker)]
-    if other:
-        return [f"estimators.{label}: {what}" for label in other]
     found = {label: tracker.hindrance(scenario.assumed) for label, tracker in trackers.items()}
     mistakes = [f"trackers.{label}: {why}" for label, why in found.items() if why]
     if not scenario.noise.real and (untried is None or scenario in untried):
@@ -184,10 +190,6 @@ def _without_paths(scenario: StateScenario) -> Iterator[str]:
 def _with_estimators(
     scenario: Scenario, estimators: Mapping[str, Any], untried: Sequence[AnyScenario] | None
 ) -> list[str]:
-    what = "tracks states that move; a measurement model takes estimators"
-    other = [label for label, one in estimators.items() if not isinstance(one, Estimator)]
-    if other:
-        return [f"estimators.{label}: {what}" for label in other]
     mistakes = []
     model = scenario.measurement
     if scenario.noise.estimated and scenario.noise.true_levels(model.m) is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -50,7 +49,7 @@ class AuditAnswer(Shown, Audit):
         the report."""
         _, *faults = self.sentences
         found: list[str] = [Fact("Also found", sentence) for sentence in faults]
-        apart = [abs(math.log(f.value)) if f.value > 0 else 0.0 for f in self.each]
+        apart = [factor.apart for factor in self.each]
         if len(apart) > 1 and max(apart) > 0:
             worst = apart.index(max(apart))
             words = f"errors of {self.claims.names[worst]} are {self.each[worst].words}."

@@ -29,8 +29,8 @@ def draw_audit(found: Audit) -> Iterator[Drawing]:
     """Draws the quantiles of errors in reported standard deviations over those of the law that the
     report claims, for the worst parameters."""
     claims = found.claims
-    apart = [abs(np.log(max(factor.value, 1e-300))) for factor in found.each]
-    worst = np.argsort(-np.array(apart), kind="stable")
+    apart = np.array([factor.apart for factor in found.each])
+    worst = np.argsort(-apart, kind="stable")
     chosen = np.sort(worst[: common.most_panels()])
     fig, axes = common.panels(len(chosen), height=3.2)
     for i, ax in zip(chosen, axes, strict=True):

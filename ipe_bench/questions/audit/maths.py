@@ -133,6 +133,11 @@ class Factor:
         return "undecided"
 
     @property
+    def apart(self) -> float:
+        """How far it lies from 1, by its logarithm."""
+        return abs(float(np.log(max(self.value, 1e-300))))
+
+    @property
     def wrong(self) -> bool:
         return self.verdict in ("too small", "too large")
 

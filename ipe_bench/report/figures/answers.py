@@ -138,16 +138,11 @@ def _alike(fits: Sequence[Fit]) -> list[list[Fit]]:
     any do."""
     known = [one for one in fits if np.isfinite(one.normalised).any()]
     passing = [one for one in known if one.passes]
-    groups: list[list[Fit]] = []
-    for one in passing or known:
-        for group in groups:
-            apart = np.abs(group[0].normalised - one.normalised)
-            if np.nanmax(apart) < _ALIKE:
-                group.append(one)
-                break
-        else:
-            groups.append([one])
-    return groups
+    return common.together(passing or known, _are_alike)
+
+
+def _are_alike(one: Fit, other: Fit) -> bool:
+    return bool(np.nanmax(np.abs(one.normalised - other.normalised)) < _ALIKE)
 
 
 def _step(m: int) -> int:

@@ -3,8 +3,8 @@ captions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
+T = TypeVar("T")
 MOST_PANELS = 8
 REACH = 0.3
 """Part of the span of the points that intervals may add to an axis at either end."""
@@ -144,6 +145,18 @@ def text(value: Any) -> str:
     """Returns a name for use in a figure: never read as mathematics, never longer than a line. Of a
     longer one the beginning and the end stand, where options tell names apart."""
     return texts([value])[str(value)]
+
+
+def together(items: Iterable[T], alike: Callable[[T, T], bool]) -> list[list[T]]:
+    """Groups items, each with the first group whose first item is alike."""
+    groups: list[list[T]] = []
+    for one in items:
+        same = [group for group in groups if alike(group[0], one)]
+        if same:
+            same[0].append(one)
+        else:
+            groups.append([one])
+    return groups
 
 
 def texts(names: Iterable[Any], most: int = 0) -> dict[str, str]:

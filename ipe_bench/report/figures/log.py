@@ -123,14 +123,8 @@ def _groups(tracks: Sequence[LogTracks]) -> list[list[LogTracks]]:
     """Returns the tracks that are known, those that pass first, and together those that cannot be
     told apart."""
     known = [one for one in tracks if _is_known(one)]
-    groups: list[list[LogTracks]] = []
-    for one in sorted(known, key=lambda one: not one.passes):
-        alike = [group for group in groups if _are_alike(group[0], one)]
-        if alike:
-            alike[0].append(one)
-        else:
-            groups.append([one])
-    return groups
+    best_first = sorted(known, key=lambda one: not one.passes)
+    return common.together(best_first, _are_alike)
 
 
 def _is_known(one: LogTracks) -> bool:
