@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, finite_or, unmasked
+from ipe_bench.basics.linalg import Array, finite_or
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
@@ -20,7 +20,7 @@ from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.real.examination import Examination
 from ipe_bench.real.fits import Fit, fit
-from ipe_bench.real.readings import SIGMA, Readings, open_together
+from ipe_bench.real.readings import SIGMA, Readings, given_readings, open_together
 from ipe_bench.real.search import examined
 from ipe_bench.trials.scenario import Scenario
 
@@ -79,14 +79,7 @@ class Question:
                 f"readings: has shape {given.shape}; give the {model.m} readings of {model.name},"
                 " NaN where missing"
             )
-        if np.iscomplexobj(given):
-            raise UserError("readings: are complex; give real numbers")
-        z = unmasked(given).copy()
-        if np.isinf(z).any():
-            raise UserError("readings: inf is not a reading; give NaN if it is missing")
-        if np.isnan(z).all():
-            raise UserError("readings: there is no reading; all are missing")
-        return Readings(informed(model, self.known), z)
+        return Readings(informed(model, self.known), given_readings(given))
 
     @cached_property
     def scenario(self) -> Scenario:

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.special import bdtrc, chdtr, chdtrc, chdtri, ndtri
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.basics.linalg import Array, Mask, deviations, unmasked
+from ipe_bench.basics.linalg import Array, Mask, deviations
 from ipe_bench.basics.options import Finite, NonNegative, Positive, option_types
 from ipe_bench.basics.statuses import Status
-from ipe_bench.real.readings import TextTable, read_tables, unit_of
+from ipe_bench.real.readings import TextTable, given_readings, read_tables, unit_of
 from ipe_bench.real.residuals import OUTLIER_LEVEL
 from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel, require_parts
@@ -131,18 +131,14 @@ class Log:
                 "readings: is not given; write readings=FILE, with the columns"
                 f" {','.join(_wanted(model))}"
             )
-        z = model.draw(0, 1).z[0] if readings is None else unmasked(readings).copy()
+        z = model.draw(0, 1).z[0] if readings is None else readings
         shape = (model.epochs, len(model.reading_names))
         if z.shape != shape:
             raise UserError(
                 f"readings: has shape {z.shape}, where {shape} belongs: epochs and readings of"
                 f" {model.name}"
             )
-        if np.isinf(z).any():
-            raise UserError("readings: inf is not a reading; give NaN if it is missing")
-        if np.isnan(z).all():
-            raise UserError("readings: there is no reading; all are missing")
-        return cls(model, z)
+        return cls(model, given_readings(z))
 
 
 def _wanted(model: StateModel) -> list[str]:

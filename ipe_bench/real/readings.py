@@ -23,7 +23,7 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.basics.files import fault_of, write_text
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, unmasked
 from ipe_bench.measurements.base import Input, Measurement, labels, with_unit
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
@@ -52,6 +52,18 @@ class Readings:
     """The columns that were read, as the file calls them."""
     files: tuple[tuple[str, str], ...] = ()
     """Each file with the SHA-256 of the bytes that were read."""
+
+
+def given_readings(given: Any) -> Array:
+    """Returns readings that are given as numbers, NaN where one is masked or missing."""
+    if np.iscomplexobj(given):
+        raise UserError("readings: are complex; give real numbers")
+    z = unmasked(given).copy()
+    if np.isinf(z).any():
+        raise UserError("readings: inf is not a reading; give NaN if it is missing")
+    if np.isnan(z).all():
+        raise UserError("readings: there is no reading; all are missing")
+    return z
 
 
 # Tables of text -----------------------------------------------------------------------------------
