@@ -68,8 +68,13 @@ def _chosen(rows: Array, used: Array | None) -> Array:
     return rows if used is None or used.all() else rows[:, used]
 
 
-def share(mask: Array) -> float:
-    return float(mask.mean()) if mask.size else np.nan
+def average(values: Array) -> float:
+    """Computes the mean of values; NaN if there is none."""
+    return float(values.mean()) if values.size else np.nan
+
+
+share = average
+"""Of truths it is their share."""
 
 
 def ratio(a: Any, b: Any) -> Array:
@@ -242,8 +247,7 @@ def capped_error(s: Sample) -> float:
     """Computes the mean Mahalanobis error of the trials that all estimators have, each at most the
     gate's radius."""
     radius = np.sqrt(gate(s.n))
-    error = np.minimum(s.distance[s.present], radius)
-    return float(error.mean()) if len(error) else np.nan
+    return average(np.minimum(s.distance[s.present], radius))
 
 
 def _tests_fit(s: Sample) -> bool:
@@ -269,20 +273,23 @@ def misfit(s: Sample) -> float:
     return share(~(s.scalars[FIT] >= FIT_LEVEL))
 
 
+def _stated(s: Sample, name: str) -> Array:
+    """Selects the finite values of a column that not every estimator has."""
+    values = s.scalars.get(name, np.empty(0))
+    return values[np.isfinite(values)]
+
+
 def ambiguous(s: Sample) -> float:
     """Computes the share of ambiguous trials among those in which the estimator has looked for
     several minima."""
-    flags = s.scalars.get(AMBIGUOUS, np.empty(0))
-    flags = flags[np.isfinite(flags)]
-    return share(flags > 0) if len(flags) else np.nan
+    return share(_stated(s, AMBIGUOUS) > 0)
 
 
 def failures_flagged(s: Sample) -> float:
-    flags = s.scalars.get(AMBIGUOUS, np.empty(0))
-    wrong = ~s.scalars["success"]
-    if not (np.isfinite(flags).any() and wrong.any()):
+    if not len(_stated(s, AMBIGUOUS)):
         return np.nan
-    return share(flags[wrong] > 0)
+    wrong = ~s.scalars["success"]
+    return share(s.scalars[AMBIGUOUS][wrong] > 0)
 
 
 def false_root_distance(s: Sample) -> float:
@@ -473,9 +480,7 @@ def calibration(s: Sample) -> Any:
 
 
 def mean_nis(s: Sample) -> float:
-    values = s.scalars.get(NIS, np.empty(0))
-    values = values[np.isfinite(values)]
-    return float(np.mean(values)) if len(values) else np.nan
+    return average(_stated(s, NIS))
 
 
 # Iterations ---------------------------------------------------------------------------------------

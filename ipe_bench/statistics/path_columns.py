@@ -86,8 +86,7 @@ def mean_score(s: Sample, name: str) -> float:
     if name not in s.scalars:
         return np.nan
     values = s.scalars[name][s.solved]
-    values = values[~np.isnan(values)]
-    return float(values.mean()) if len(values) else np.nan
+    return f.share(values[~np.isnan(values)])
 
 
 def path_success(s: Sample) -> tuple[float, float, float]:
@@ -129,10 +128,8 @@ def _white_p(s: Sample) -> Array:
 def not_white(s: Sample) -> tuple[float, float, float]:
     """Computes the share of trials with autocorrelated innovations, and the ends of its
     interval."""
-    p = _white_p(s)
-    rejected = int((p < NOT_WHITE).sum())
-    share = rejected / len(p) if len(p) else np.nan
-    return share, *clopper_pearson(rejected, len(p))
+    rejected = _white_p(s) < NOT_WHITE
+    return f.share(rejected), *clopper_pearson(int(rejected.sum()), len(rejected))
 
 
 def epoch_curves(s: Sample) -> Iterator[dict[str, Any]]:

@@ -21,6 +21,7 @@ from ipe_bench.questions.compare.maths import (
     compared,
     comparison_title,
     gone,
+    kind_of,
     left_out,
     other_sources,
     too_few,
@@ -148,7 +149,7 @@ def write_comparison(folder: Path, frame: Comparison, sources: Sequence[tuple[st
 
 def _margins(frame: Comparison, quantities: Iterable[str]) -> str:
     """Words the margins of these quantities."""
-    kinds = dict.fromkeys(quantity.partition(" ")[0] for quantity in quantities)
+    kinds = dict.fromkeys(map(kind_of, quantities))
     margins = frame.attrs["margins"]
     return ", ".join(f"{_margin(kind, margins[kind])} in {kind}" for kind in kinds)
 
@@ -243,7 +244,7 @@ def _extent(found: Sequence[dict[str, Any]], number: int) -> str:
     title = _TITLES.get(quantity, quantity)
     if number > 1:
         return f"{title} ({len(found)} of {number} comparisons)"
-    sign = _AS.get(quantity.split()[0], "×")
+    sign = _AS.get(kind_of(quantity), "×")
     return f"{title} ({sign}{_cells(row, _INTERVAL)['change']})"
 
 
@@ -306,7 +307,7 @@ def _change(quantity: str, value: float, more: int = 0) -> str:
     so many `more` figures than usual."""
     if quantity == "success":
         return f"{100 * value:+.{1 + more}f}"
-    if quantity.startswith("bias "):
+    if kind_of(quantity) == "bias":
         return f"{value:+.{3 + more}f}"
     if 0.1 <= value < 9.9995:
         return f"{value:.{3 + more}f}"
@@ -381,14 +382,15 @@ def compared_folders(
         # Other rows have no such numbers, which would make floats of them.
         for column in ("discordant", "trials_needed"):
             frame[column] = frame[column].astype("Int64")
-    frame.attrs["problems"] = list(dict.fromkeys([*ours.problems, *theirs.problems]))
-    frame.attrs["stale"] = list(dict.fromkeys([*ours.stale, *theirs.stale]))
-    frame.attrs["problems"] += lacking
-    frame.attrs["worse"] = _worse(frame, _FAILING if fail_on is None else fail_on)
-    frame.attrs["notes"] = [*few, *left_out(ours, theirs), *other_sources(ours, theirs)]
-    frame.attrs["margins"] = widened
-    frame.attrs["alpha"] = alpha
-    frame.attrs["anytime"] = anytime
+    frame.attrs |= {
+        "problems": [*dict.fromkeys([*ours.problems, *theirs.problems]), *lacking],
+        "stale": list(dict.fromkeys([*ours.stale, *theirs.stale])),
+        "worse": _worse(frame, _FAILING if fail_on is None else fail_on),
+        "notes": [*few, *left_out(ours, theirs), *other_sources(ours, theirs)],
+        "margins": widened,
+        "alpha": alpha,
+        "anytime": anytime,
+    }
     if output is not None:
         write_comparison(Path(output), frame, read)
     return frame
@@ -427,7 +429,7 @@ def _places(folders: Sequence[Path]) -> set[Path]:
 
 def _worse(frame: Comparison, failing: Sequence[str]) -> list[str]:
     """Returns a line for each finding that fails the comparison."""
-    kinds = frame["quantity"].str.split(" ").str[0]
+    kinds = frame["quantity"].map(kind_of)
     worse = frame[(frame["finding"] == "worse") & kinds.isin(list(failing))]
     rows: list[Any] = worse.to_dict("records")
     return [f"{row['second']} in {row['quantity']}, {comparison_title(row)}" for row in rows]

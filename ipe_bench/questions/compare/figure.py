@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ipe_bench.questions.compare.maths import comparison_title
+from ipe_bench.questions.compare.maths import comparison_title, kind_of
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, FAMILIES, WHITE, Look, strong
@@ -69,7 +69,7 @@ def draw_pairs(frame: pd.DataFrame) -> Iterator[Drawing]:
     fig.set_figheight((0.4 * len(look) + 0.75) * len(kinds) + 0.3)
     told = []
     for kind, ax in zip(kinds, axes, strict=True):
-        measure = _measure(kind, frame.attrs["margins"][kind.partition(" ")[0]])
+        measure = _measure(kind, frame.attrs["margins"][kind_of(kind)])
         named = [(row, name) for row, name in zip(rows, names, strict=True) if name in look]
         shown = [(row, labels.index(name)) for row, name in named if row["quantity"] == kind]
         for row, y in shown:

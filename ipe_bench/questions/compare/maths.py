@@ -76,8 +76,12 @@ class _Column(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The quantity without the name of its parameter."""
-        return self.quantity.partition(" ")[0]
+        return kind_of(self.quantity)
+
+
+def kind_of(quantity: str) -> str:
+    """Returns a quantity without the name of its parameter."""
+    return quantity.partition(" ")[0]
 
 
 def comparison_title(row: Mapping[str, Any]) -> str:
@@ -137,7 +141,7 @@ def compared(
 
 def _finding(quantity: str, loss: tuple[float, float], margins: Mapping[str, float]) -> str:
     """Words a change whose whole interval lies beyond the margin, else returns nothing."""
-    kind = quantity.partition(" ")[0]
+    kind = kind_of(quantity)
     margin = margins[kind]
     if kind not in ("success", "bias"):
         # The loss is one of logarithms.
