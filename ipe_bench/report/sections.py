@@ -9,7 +9,8 @@ from typing import Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.plugins.extensions import added, require_type
-from ipe_bench.report.tables.reports import all_tables, certified_tables
+from ipe_bench.report.tables.certified import certified_tables
+from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.report.tables.table import Part, Table
 from ipe_bench.statistics.analysis import Analysis
 

@@ -43,8 +43,8 @@ from ipe_bench.report.figures.views import views
 from ipe_bench.report.page.headline import headline
 from ipe_bench.report.sections import report_tables
 from ipe_bench.report.style import house_style
+from ipe_bench.report.tables.certified import certified_tables
 from ipe_bench.report.tables.matrix import SUCCESS
-from ipe_bench.report.tables.reports import certified_tables
 from ipe_bench.report.tables.table import environment, html, markdown
 from ipe_bench.report.words import brief, enumerate_few, percent
 from ipe_bench.statistics.analysis import Analysis, analyse

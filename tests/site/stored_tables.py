@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 from gallery_frames import SUFFIX, read
 
-from ipe_bench.report.tables.reports import certified_tables
+from ipe_bench.report.tables.certified import certified_tables
 from ipe_bench.report.tables.settings import Wording
 from ipe_bench.report.words import brief, share_text
 from ipe_bench.statistics.analysis import Analysis

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.report.tables.settings import MOST_SETTINGS, Wording
-from ipe_bench.report.tables.table import Column, Table, column, words
+from ipe_bench.report.tables.table import Column, Table, column, counts_of, texts_of, words
 from ipe_bench.report.tables.terminal import (
     leading,
     overview_columns,
@@ -19,8 +19,6 @@ from ipe_bench.report.tables.terminal import (
 )
 from ipe_bench.report.words import enumerate_few, p_value, percent, short, value_text, varying
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.certified import certified_averages, certified_table, published_table
-from ipe_bench.statistics.collect import Collection
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.statistic import ALL, Where, frame_columns
 
@@ -134,14 +132,6 @@ def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
     return [*told, column("error scale", rows["error_scale"], value_text)]
 
 
-def _texts(rows: pd.DataFrame, *names: str) -> list[Column]:
-    return [words(name, rows[name]) for name in names]
-
-
-def _counts(rows: pd.DataFrame, *names: str) -> list[Column]:
-    return [column(name, rows[name], str) for name in names]
-
-
 def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table | None:
     """Returns the table of the statistics whose records name it, behind the estimators and other
     columns of names."""
@@ -153,7 +143,7 @@ def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table |
     if rows.empty:
         return None
     told: Any = rows.to_dict("records")
-    columns = [*head(analysis, rows), *_texts(rows, *names), *statistics(where, told)]
+    columns = [*head(analysis, rows), *texts_of(rows, *names), *statistics(where, told)]
     stored = frame_columns(shown_in(where))
     data = rows[[*analysis.setting_columns, "error_scale", *names, *stored]]
     return Table(where, title, caption, columns, data)
@@ -206,8 +196,8 @@ def comparisons(analysis: Analysis) -> Table | None:
         return None
     closer = [f"{label} is closer" if label else "no difference" for label in rows["closer"]]
     columns = head(analysis, rows)
-    columns += _texts(rows, "first", "second")
-    columns += _counts(rows, "trials", "wins", "ties", "losses")
+    columns += texts_of(rows, "first", "second")
+    columns += counts_of(rows, "trials", "wins", "ties", "losses")
     for title, name, show in (
         ("median difference", "median_difference", short),
         ("p of error", "p_error", p_value),
@@ -235,74 +225,9 @@ def endings(analysis: Analysis) -> Table | None:
     told = rows.groupby(same, sort=False, dropna=False)["estimator"].agg(list).reset_index()
     told["estimator"] = told["estimator"].map(enumerate_few)
     columns = head(analysis, told)
-    columns += _texts(told, "estimator", "status")
-    columns += _counts(told, "trials")
+    columns += texts_of(told, "estimator", "status")
+    columns += counts_of(told, "trials")
     columns.append(column("share", told["share"], percent))
-    columns += _texts(told, "first", "message")
+    columns += texts_of(told, "first", "message")
     caption = "Trials that did not converge, by reason, with the first example of each."
     return Table("endings", "Trials that did not converge", caption, columns, rows)
-
-
-def certified_tables(collection: Collection) -> list[Table]:
-    """Returns digits per data set with averages, and published errors, if there are data; a
-    terminal shows those that name the file with the `whole`."""
-    digits = certified_table(collection)
-    found = [] if digits.empty else _digits(digits)
-    published = published_table(collection)
-    if len(published):
-        found.append(_published(published, collection))
-    return found
-
-
-def _digits(digits: pd.DataFrame) -> list[Table]:
-    """Returns the mean digits of an estimator from each start, the most first, and its digits per
-    data set."""
-    caption = (
-        "Log relative error against the certified answer, at most 11. It is the smallest over the"
-        " parameters of a data set, the smallest over their standard deviations, and the error of"
-        " the residual sum of squares."
-    )
-    columns = [words("data set", digits["dataset"])]
-    columns += _counts(digits, "start")
-    columns += _texts(digits, "estimator")
-    columns += _lre(digits, "")
-    columns += _texts(digits, "status")
-    each = Table("certified", "Certified readings", caption, columns, digits.round(2))
-    rows = certified_averages(digits).sort_values(["mean_lre_parameters", "start"], ascending=False)
-    columns = _texts(rows, "estimator")
-    columns += _counts(rows, "start")
-    columns.append(column("data sets", rows["datasets"], str))
-    columns += _counts(rows, "solved")
-    columns += _lre(rows, "mean_")
-    columns.append(column("deviations to 6 digits", rows["deviations_to_6_digits"], str))
-    caption += " Averaged over the data sets; solved: four digits or more of every parameter."
-    title = "Certified readings, averages"
-    whole = "tables/certified_averages.csv"
-    return [Table("certified_averages", title, caption, columns, rows.round(2), whole=whole), each]
-
-
-def _published(rows: pd.DataFrame, collection: Collection) -> Table:
-    columns = _texts(rows, "model", "state", "estimator")
-    columns += [column(name, rows[name], "{:.12f}".format) for name in ("published", "found")]
-    columns.append(column("difference", rows["difference"], "{:.1e}".format))
-    scenarios = [group.footer["identity"]["scenario"] for group in collection.groups]
-    models = [scenario.get("model", {}) for scenario in scenarios]
-    sources = dict.fromkeys(model["source"] for model in models if "source" in model)
-    caption = (
-        "Root mean square errors over all time steps of one stored path, beside those that are"
-        f" published. {' '.join(sources)}"
-    )
-    title = "Published errors of trackers"
-    return Table("published", title, caption, columns, rows, whole="tables/published.csv")
-
-
-_LRE = {
-    "parameters": "digits of parameters",
-    "deviations": "of deviations",
-    "rss": "of residuals",
-}
-
-
-def _lre(rows: pd.DataFrame, prefix: str) -> list[Column]:
-    shown = "{:.2f}".format
-    return [column(title, rows[f"{prefix}lre_{name}"], shown) for name, title in _LRE.items()]

@@ -194,6 +194,16 @@ def words(title: str, values: Iterable[Any], best: Iterable[bool] = ()) -> Colum
     return Column(title, cells(map(str, values), repeat(None), best), numeric=False)
 
 
+def texts_of(rows: pd.DataFrame, *names: str) -> list[Column]:
+    """Makes columns of the texts in a frame, under their own names."""
+    return [words(name, rows[name]) for name in names]
+
+
+def counts_of(rows: pd.DataFrame, *names: str) -> list[Column]:
+    """Makes columns of the whole numbers in a frame, under their own names."""
+    return [column(name, rows[name], str) for name in names]
+
+
 def naming(title: str, things: Iterable[Any]) -> list[Column]:
     """Makes the columns of the names of parameters or states, and of their units."""
     named = [(one.name, one.unit) for one in things]

@@ -138,7 +138,7 @@ def _totals(rows: Sequence[Mapping[str, Any]], collection: Collection | None) ->
     """Returns the tables of certified runs that a terminal shows."""
     if collection is None or all(row["noise"] != "certified" for row in rows):
         return []
-    from ipe_bench.report.tables.reports import certified_tables  # which loads pandas
+    from ipe_bench.report.tables.certified import certified_tables  # which loads pandas
 
     return [table for table in certified_tables(collection) if table.whole]
 
