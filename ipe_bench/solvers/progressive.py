@@ -18,7 +18,8 @@ from ipe_bench.estimators.driver import Limits
 from ipe_bench.estimators.minima import WRONG_MINIMUM, Minima, passes
 from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.solvers.attempts import Stages, Windows
+from ipe_bench.solvers.starts import Starts
+from ipe_bench.solvers.windows import Windows
 
 # Halved or doubled, each leaves 155 of 160 trials solved, or one more with `_READINGS` doubled, and
 # the cost within 2 %: `python tests/benchmarks/constants.py progressive`.
@@ -144,8 +145,8 @@ class Progressive(Estimator):
         status = np.where(raised, Status.ERROR, best.status)
         return replace(best, status=status.astype(np.int8)), tally
 
-    def _attempts(self, problem: Problem, z: Array, history: bool) -> Stages | Windows:
-        kind = Stages if problem.measurement.epochs is None else Windows
+    def _attempts(self, problem: Problem, z: Array, history: bool) -> Starts | Windows:
+        kind = Starts if problem.measurement.epochs is None else Windows
         prior = problem.prior_used(self.prior_inflation) if self.use_prior else None
         limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
         return kind(
