@@ -34,6 +34,8 @@ _RANDOM = 4
 """The first attempt from a random start."""
 _HALVING = (6, 13, 14, 15)
 """The attempts that begin from several random starts."""
+_LOOKED_AT = (4, 5, 7, 8, 9, 10, 11, 12)
+"""The attempts that begin from the best of several random points."""
 _HALVINGS = ((5, 5), (15, 2), (_SHORT, 1))
 """Steps from each of these starts, and how many of them are kept."""
 
@@ -87,14 +89,14 @@ class Starts(Attempts):
         if k < _RANDOM:
             direction = x0 if x0.any() else np.ones(len(x0))
             return np.multiply.outer(_RAYS, direction)
-        stream = k if k < min(_HALVING) else k - 1
+        stream = _stream(k)
         if self.prior is not None:
-            return self._of_prior(stream)
+            return self._of_prior(self.prior, stream)
         return self._of_any_size(stream) if stream % 2 == 0 else self._about_start(stream)
 
-    def _of_prior(self, stream: int) -> Array:
+    def _of_prior(self, prior: Array, stream: int) -> Array:
         x0 = self.problem.x0
-        return x0 + self.prior * generator(stream).standard_normal((_LOOKS, len(x0)))
+        return x0 + prior * generator(stream).standard_normal((_LOOKS, len(x0)))
 
     def _of_any_size(self, stream: int) -> Array:
         """Draws points of any sign, from a hundredth to 3."""
@@ -123,7 +125,7 @@ class Starts(Attempts):
         """Starts from 20 wide draws and drops the worst after few steps (successive halving): how
         well a start fits says little."""
         owner = np.repeat(rows, _LOOKS)
-        x = np.tile(self._wide(k), (len(rows), 1))
+        x = np.tile(self._wide(_stream(k)), (len(rows), 1))
         found = Minima.nowhere(x, self.limits.history)
         for steps, most in _HALVINGS:
             found = continued(found, self.minimize(owner, _FROM_AFAR, found.x, steps))
@@ -145,6 +147,12 @@ class Starts(Attempts):
             cost.append(squared(objective.residual(x)))
         self.charge(rows, objective.model.tally)
         return finite_or(np.inf, np.stack(cost, axis=1))
+
+
+def _stream(k: int) -> int:
+    """Returns the number of the random stream of the k-th attempt, which is its own: draws of two
+    attempts are independent."""
+    return _RANDOM + (*_LOOKED_AT, *_HALVING).index(k)
 
 
 def _best_unlike_the_best(cost: Array) -> Rows:

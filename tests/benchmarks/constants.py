@@ -2,7 +2,7 @@
 multiplied by it, and what is reached and its cost stand beside today's.
 
 `python tests/benchmarks/constants.py [MODULE [NAME ...]]` prints a Markdown table; modules are
-chords, attempts, progressive and auto.
+chords, starts, windows, progressive and auto.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ NAMES = {
         *("_ITERATIONS", "_TRIED", "_PER_DECADE", "_NEAR_ROOT", "_CHORDS"),
         *("_JACOBIANS", "_BENT", "_CONTRACTING", "_DEPTH"),
     ),
-    "attempts": (
-        *("_LONG", "_PROMISING", "_SHORT", "_APART", "_LOOKS"),
-        *("_DAMPING", "_FIRST_ITERATIONS", "_FIRST_DRAWS", "_RANDOMISED"),
+    "starts": ("LONG", "_PROMISING", "_SHORT", "_APART", "_LOOKS"),
+    "windows": (
+        *("_DAMPING", "_FIRST_ITERATIONS", "_SLOW_GROWTH", "_FIRST_DRAWS", "_RANDOMISED"),
         *("_AS_BAD",),
     ),
     "progressive": ("_SAME_FIT", "_BULK", "_READINGS", "_TRUSTED", "_WORTH"),
@@ -50,7 +50,7 @@ def cells() -> list[Scenario]:
 def outcome(drawn: list[tuple[Scenario, Any]], module: str) -> tuple[int, float]:
     """How many trials are solved, and the mean logarithm of the cost."""
     solved, logarithms = 0, []
-    estimator = Progressive() if module in ("attempts", "progressive") else Auto()
+    estimator = Progressive() if module in ("starts", "windows", "progressive") else Auto()
     for scenario, trials in drawn:
         found = estimator.estimate(scenario.problem, trials.z)
         deviation = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))

@@ -15,6 +15,7 @@ from ipe_bench.noise import Gaussian, Quantization, Unknown
 from ipe_bench.real.fits import Fit, fit
 from ipe_bench.solvers import Auto, FixedPoint, Newton, Progressive
 from ipe_bench.solvers.auto import CHORDS, PROGRESSIVE
+from ipe_bench.solvers.starts import _stream
 from ipe_bench.trials.roots import least_squares_root
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import Block
@@ -94,9 +95,20 @@ def test_starts_of_any_size_are_the_same_whatever_the_prior_says():
     for scale in (0.1, 10.0):
         problem = Scenario(model, Gaussian(0.02), error_scale=scale).problem
         attempts = Progressive()._attempts(problem, np.zeros((1, 3)), False)
-        starts.append(attempts._points(6, wide=True))
+        starts.append(attempts._wide(12))
     np.testing.assert_array_equal(*starts)
     assert np.abs(starts[0]).max() > 5.0
+
+
+def test_the_draws_of_no_attempt_tell_those_of_another():
+    """From one stream the sizes of one attempt told all signs of another."""
+    model = Formula("a*exp(-b*t)", {"a": 2.0, "b": 0.5}, {"t": [1.0, 2.0, 3.0]})
+    problem = Scenario(model, Gaussian(0.02), error_scale=1.0).problem.without_prior()
+    attempts = Progressive()._attempts(problem, np.zeros((1, 3)), False)
+    streams = [_stream(k) for k in range(4, attempts.planned)]
+    assert sorted(streams) == [*range(4, attempts.planned)]
+    sizes, signs = np.abs(attempts._looked_at(7)), np.sign(attempts._wide(_stream(6)))
+    assert abs(np.corrcoef(sizes.ravel(), signs.ravel())[0, 1]) < 0.4
 
 
 def test_what_is_nearly_linear_costs_no_more_than_fixed_point_iteration_and_half_again():
