@@ -4,6 +4,7 @@ covariance."""
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import pytest
@@ -258,3 +259,20 @@ def test_a_screen_has_as_many_settings_as_fit_with_their_heads_and_at_least_one(
     used = sum(len(one) + 4 for one in kept.values())
     assert used <= 0.4 * _MOST_LINES < used + len(rows) + 4
     assert list(_shortened({"long": rows * 100})) == ["long"]
+
+
+def test_a_notebook_has_the_number_of_every_tile():
+    """It showed those of the first column alone."""
+    (matrix,) = matrices(rows_of({"a": (200, 190, 0), "b": (150, 90, 10)}))
+    shown = re.findall(r'<span class="success t\d+[^"]*">([\d.]+)', html([matrix]))
+    assert shown == [tile.number for row in matrix.rows for tile in row[1:]]
+
+
+def test_rows_that_say_the_same_are_one_where_only_success_is_shown():
+    (matrix,) = matrices(rows_of({"a": (200, 100), "b": (200, 100), "c": (200, 100)}))
+    assert [cell.text for cell in matrix.folded().columns[0].cells] == ["all 3"]
+    assert "all 3" in plain_text([matrix])
+    assert html([matrix]).count("<tr data-name") == 1
+    for counts in ({"a": (200, 100), "b": (200, 100)}, {"a": (200,), "b": (200,), "c": (199,)}):
+        kept = matrices(rows_of({name: (*each, 0) for name, each in counts.items()}))
+        assert all(one.joined() is one for one in kept)

@@ -116,7 +116,7 @@ def _rows(view: View, rows: pd.DataFrame, scale: float) -> Iterator[Drawing]:
         ax.plot([1.0, error], [i, i], solid_capstyle="butt", zorder=1, **bar)
     ratios = errors.div(errors[best], axis=0)
     alike = len(errors.columns) > 1 and bool((abs(ratios - 1) <= _ALIKE).all(axis=None))
-    common.title(ax, f"all {len(errors.columns)} estimators" if alike else best)
+    ax.set_title(f"all {len(errors.columns)} estimators" if alike else best)
     ax.set_yticks([])
     ax.set_ylim(len(look) - 0.6, -1.0)
     deepest = _write(ax, own, look)

@@ -57,6 +57,8 @@ _FAR = 10.0
 """Factor by which an error or NEES is off that has the colour of no success."""
 MOST_MATRICES = 6
 """Settings that have a matrix each; the table has the others."""
+_SEVERAL = 3
+"""Rows from which equal ones are one."""
 _BESIDE = 5
 """Lines of a matrix in a terminal besides its rows."""
 LONG = 12
@@ -148,9 +150,23 @@ class Matrix(Table):
             titles += [""] * (len(same) - 1)
         return titles
 
+    def joined(self) -> Matrix:
+        """Returns one row in place of all, if there are several and their success is the same."""
+        names, *others = self.columns
+        rows = len(names.cells)
+        alike = all(
+            len({(cell.text, cell.style) for cell in column.cells}) == 1 for column in others
+        )
+        if rows < _SEVERAL or not alike:
+            return self
+        first = replace(names, cells=[Cell(f"all {rows}")])
+        return replace(
+            self, columns=[first, *(replace(one, cells=one.cells[:1]) for one in others)]
+        )
+
     def folded(self) -> Matrix:
         """Returns the same as it stands on paper."""
-        pairs = zip(self.columns, self.on_paper, strict=True)
+        pairs = zip(self.joined().columns, self.on_paper, strict=True)
         columns = [replace(column, title=title) for column, title in pairs if title]
         return replace(self, columns=columns)
 
