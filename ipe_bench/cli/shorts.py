@@ -266,9 +266,12 @@ class _Reader:
             return self._equations(model)
         return self._formula(model)
 
-    def _short(self, words: Sequence[str], assumed: Sequence[str]) -> Short:
+    def _short(
+        self, words: Sequence[str], assumed: Sequence[str], left_out: Sequence[str] = ()
+    ) -> Short:
         # What was typed comes last, and replaces what the short form sets.
-        return Short([*words, *self.others], self.files, [line for line in assumed if line])
+        last = [self._ignoring(left_out)] if left_out else []
+        return Short([*words, *self.others, *last], self.files, [line for line in assumed if line])
 
     def _refuse_bare(self, names: Sequence[str]) -> None:
         """Refuses a bare parameter as a key."""
@@ -284,8 +287,14 @@ class _Reader:
 
     def _free(self, taken: Sequence[str]) -> list[str]:
         """Lists the columns besides those that the model takes, sigma and those left out."""
-        known = (*taken, SIGMA, *self._ignored)
-        return [name for name in self.columns if name not in known]
+        known = {*taken, SIGMA, *self._ignored}
+        free = [name for name in self.columns if name not in known]
+        return [name for name in free if name not in self.texts] or free
+
+    def _remarks(self, taken: Sequence[str], reading: str) -> list[str]:
+        """Lists the columns of texts that stand beside the readings, and are left out."""
+        known = {*taken, reading, SIGMA, *self._ignored}
+        return [name for name in self.texts if name not in known]
 
     @property
     def _ignored(self) -> list[str]:
@@ -302,6 +311,17 @@ class _Reader:
     def columns(self) -> list[str]:
         """Columns of the first file."""
         return _columns(self.files[0])
+
+    @cached_property
+    def texts(self) -> list[str]:
+        """Columns of the first file that have texts and no number, such as remarks."""
+        (table,) = read_tables([Path(self.files[0])])
+        found = []
+        for heading in table.heading:
+            cells = [text for text, _ in table.column(heading) if text.strip()]
+            if cells and all(table.number(text) is None for text in cells):
+                found.append(quantity(heading))
+        return found
 
     def _reading(self, what: str, taken: Sequence[str], usual: Sequence[str]) -> str:
         """Finds the column of the readings: the one that is typed, has a usual name, or is left."""
@@ -323,6 +343,13 @@ class _Reader:
             raise UserError(
                 f"{self.files[0]}: no name in {what} is a column (there are {', '.join(free)});"
                 " correct the name, as columns are what the readings depend on"
+            )
+        stems = {name.rstrip("0123456789") for name in free}
+        if len(stems) == 1 and stems.isdisjoint(free):
+            raise UserError(
+                f"{self.files[0]}: columns {enumerate_few(free)} look like repeated readings; write"
+                f" them below each other in one column reading, and repeat {enumerate_few(taken)}"
+                " beside them"
             )
         rest = self._ignoring(free[1:])
         raise UserError(
@@ -401,7 +428,8 @@ class _Reader:
         shown = {name: value for name, value in shown.items() if value}
         self._refuse_bare([one.arg for one in arguments])
         model = f"Model: {what} of {file}{_values(shown)}."
-        return self._short(words, [model, self._told(wanted, reading), self._noise()])
+        told = [model, self._told(wanted, reading), self._noise()]
+        return self._short(words, told, self._remarks(wanted, reading))
 
     @property
     def _started(self) -> dict[str, str]:
@@ -437,7 +465,9 @@ class _Reader:
 
     def _told(self, columns: Sequence[str], reading: str) -> str:
         taken = f"columns {enumerate_few(columns)}" if columns else "no column"
-        return f"Readings: column {reading} of {', '.join(self.files)}; {taken}."
+        remarks = enumerate_few(self._remarks(columns, reading))
+        left_out = f"; {remarks}, without numbers, left out" if remarks else ""
+        return f"Readings: column {reading} of {', '.join(self.files)}; {taken}{left_out}."
 
     # Formulas
 
@@ -468,7 +498,8 @@ class _Reader:
         parameters = [name for name in names if name not in columns]
         remedy = f"measurement.start.{parameters[0]}=X sets another"
         model = f"Model: {formula}{start}; {remedy}."
-        return self._short(words, [model, self._told(columns, reading), self._noise()])
+        told = [model, self._told(columns, reading), self._noise()]
+        return self._short(words, told, self._remarks(columns, reading))
 
     def _refuse_without_column(self, names: Sequence[str], usual: Sequence[str]) -> NoReturn:
         """Refuses a formula of names that are no columns; one may be short for a column."""

@@ -225,7 +225,13 @@ class Function(WrittenModel):
             if np.iscomplexobj(values):  # functions of `math` refuse them
                 return self._at(values.real)
             file = getattr(sys.modules.get(self.function.__module__), "__file__", None)
-            raise UserError(f"measurement.of={self.of}: {place_of(error, file)}") from error
+            remedy = ""
+            if isinstance(error, TypeError) and "scalar" in str(error):
+                remedy = (
+                    f"; columns ({', '.join(self.headings)}) are arrays with a number per reading:"
+                    " write np.exp in place of math.exp, and so on"
+                )
+            raise UserError(f"measurement.of={self.of}: {place_of(error, file)}{remedy}") from error
 
     def _checked(self, z: Any, m: int | None) -> Any:
         if np.ndim(z) != 1 or m not in (None, len(z)):

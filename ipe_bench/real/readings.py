@@ -30,6 +30,8 @@ from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, inform
 
 SIGMA = "sigma"
 """The column of standard deviations of the readings."""
+_IN_PARENTHESES = re.compile(r"\s*(?P<name>[^\[(]+?)\s+\((?P<unit>[^()]*)\)\s*")
+"""A heading with its unit behind a blank."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NOT_FINITE = ("nan", "inf", "infinity")
 _MISSING = "a missing reading is an empty cell"
@@ -117,7 +119,7 @@ class TextTable:
         """Finds the column of that heading; a heading without a unit is found with one, too."""
         if wanted in self.heading:
             return wanted
-        if " [" in wanted:
+        if quantity(wanted) != wanted:
             return None
         return next((name for name in self.heading if quantity(name) == wanted), None)
 
@@ -130,7 +132,7 @@ class TextTable:
             remedy = "remove it"
             if name:
                 what = f"column {name}"
-                remedy = f"remove it, or set ignore_columns=[{name.split(' [')[0]}]"
+                remedy = f"remove it, or set ignore_columns=[{quantity(name)}]"
             meant = did_you_mean(name, [one for one in wanted if one not in self.heading])
             hint = f"{meant} Otherwise" if meant else ";"
             raise self.error(
@@ -157,12 +159,18 @@ def _number(text: str) -> float | None:
 
 
 def quantity(heading: str) -> str:
-    """Returns a heading such as `height [m]` without its unit."""
+    """Returns a heading such as `height [m]` or `height (m)` without its unit."""
+    in_parentheses = _IN_PARENTHESES.fullmatch(heading)
+    if in_parentheses:
+        return in_parentheses["name"]
     return heading.partition(" [")[0].strip()
 
 
 def unit_of(heading: str) -> str:
-    """Returns the unit of a heading such as `height [m]`; empty if it has none."""
+    """Returns the unit of a heading such as `height [m]` or `height (m)`; empty if it has none."""
+    in_parentheses = _IN_PARENTHESES.fullmatch(heading)
+    if in_parentheses:
+        return in_parentheses["unit"]
     return heading.partition("[")[2].rstrip("] ")
 
 

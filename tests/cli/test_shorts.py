@@ -11,6 +11,7 @@ import pytest
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import shorts
+from ipe_bench.cli.single import single
 
 T = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0])
 FILES = {
@@ -298,3 +299,40 @@ def test_exact_readings_have_no_noise_to_simulate(ipe_bench, folder: Path, comma
     code, _, err = ipe_bench(command, "a*t + b", "exact.csv")
     assert code == 2
     assert "the residuals are zero" in err
+
+
+@pytest.mark.parametrize(
+    ("text", "reading", "told"),
+    [
+        ("t (s);h (m);who\n0,5;98,8;A\n1;95,1;\n", "h", "; who, without numbers, left out."),
+        ("name,t,remark,h\na,0.5,,98.8\nb,1,windy,95.1\n", "h", "; name, remark, without numbers"),
+        ("t [s],h [m]\n0.5,98.8\n1,95.1\n", "h", "; columns t."),
+    ],
+)
+def test_texts_beside_the_readings_are_left_out_and_said(
+    text: str, reading: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.csv").write_text(text, encoding="utf-8-sig")
+    short = shorts.read("estimate", ["a - 4.9*t*t", "own.csv"])
+    assert f"measurement.reading='{reading}'" in short.words
+    assert told in short.assumed[1]
+    found = single("estimate", short.in_full).spec.question(()).checked()
+    assert found.found.z.tolist() == [98.8, 95.1]
+
+
+def test_repeated_readings_and_scalar_functions_are_refused_with_what_to_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mm.py").write_text("def rate(S, V=10, K=2):\n    return V * S / (K + S)\n")
+    (tmp_path / "enzyme.csv").write_text("S,rep1,rep2\n1,3.4,3.1\n2,5.2,4.8\n")
+    with pytest.raises(UserError, match="write them below each other in one column reading, and"):
+        shorts.read("estimate", ["mm.py", "enzyme.csv"])
+    (tmp_path / "scalar.py").write_text(
+        "import math\n\ndef f(t, a=1.0):\n    return a * math.exp(t)\n"
+    )
+    (tmp_path / "scalar.csv").write_text("t,reading\n1,3.4\n2,5.2\n")
+    short = shorts.read("estimate", ["scalar.py", "scalar.csv"])
+    with pytest.raises(UserError, match=r"columns \(t\) are arrays .* np.exp in place of math.exp"):
+        single("estimate", short.in_full).spec.question(()).checked()
