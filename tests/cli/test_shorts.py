@@ -317,8 +317,8 @@ def test_texts_beside_the_readings_are_left_out_and_said(
     short = shorts.read("estimate", ["a - 4.9*t*t", "own.csv"])
     assert f"measurement.reading='{reading}'" in short.words
     assert told in short.assumed[1]
-    found = single("estimate", short.in_full).spec.question(()).checked()
-    assert found.found.z.tolist() == [98.8, 95.1]
+    question = single("estimate", short.in_full).spec.question(())
+    assert question.found.z.tolist() == [98.8, 95.1]
 
 
 def test_repeated_readings_and_scalar_functions_are_refused_with_what_to_write(
