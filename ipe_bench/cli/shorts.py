@@ -549,7 +549,18 @@ class _Reader:
             words = ["measurement=ode", f"measurement.file={file}"]
             words += _title("measurement", file, content)
             model = f"Model: differential equations of {file}."
-            return self._short(words, [model, f"Readings: {files}.", self._noise()])
+            read = [
+                name for name in content.get("outputs", content["rates"]) if name in self._free([])
+            ]
+            if "output" in self.columns or len(read) < 2:
+                return self._short(words, [model, f"Readings: {files}.", self._noise()])
+            readings = f"Readings: columns {enumerate_few(read)} of {files}."
+            stated = any(word.startswith("noise") for word in self.others)
+            if stated or not {SIGMA, f"{SIGMA}_{read[0]}"}.isdisjoint(self.columns):
+                return self._short(words, [model, readings])
+            words += ["noise=unknown", "noise.by=output"]
+            noise = "Noise: a level for each of these columns, estimated from its residuals."
+            return self._short(words, [model, readings, noise])
         there = f"its keys are {', '.join(map(str, keys))}" if keys else "it has no keys"
         raise UserError(
             f"{file}: is no model: it has neither next: (a state model by formulas) nor rates:"

@@ -63,6 +63,8 @@ class Input:
     """Whether it is part of what tells readings apart, and stands in every file."""
     default: Any = None
     """Value if the file lacks the column; None: required as soon as the file has any input."""
+    choices: tuple[str, ...] = ()
+    """What a label may say; a file may have a column of readings for each instead."""
 
 
 @dataclass(frozen=True)

@@ -380,6 +380,7 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
 
 def _readings_in(table: TextTable, model: Measurement) -> Readings:
     """Reads a file, which may have too few readings."""
+    table = _stacked(table, model)
     sigma = table.find(SIGMA)
     columns = {wanted: table.find(wanted.heading) for wanted in model.inputs}
     if not columns or _knows_rows(model, columns):
@@ -410,6 +411,45 @@ def _readings_in(table: TextTable, model: Measurement) -> Readings:
         if name not in known and name in table.heading:
             _require_order(table, name, values)
     return Readings(sampled, z, _sigmas(table, sigma, range(len(z)), z, shown), used)
+
+
+def _stacked(table: TextTable, model: Measurement) -> TextTable:
+    """Gives each reading a row of its own, where a table has a column of readings for each choice
+    of a label, such as prey and predator for output, and perhaps of their standard deviations."""
+    for label in model.inputs:
+        found = {choice: table.find(choice) for choice in label.choices}
+        columns = {choice: name for choice, name in found.items() if name is not None}
+        if columns and not any(map(table.find, (label.heading, *_shown_as(model)))):
+            return _stack(table, label.heading, columns)
+    return table
+
+
+def _stack(table: TextTable, label: str, columns: Mapping[str, str]) -> TextTable:
+    found = {choice: table.find(f"{SIGMA}_{choice}") for choice in columns}
+    sigmas = {choice: name for choice, name in found.items() if name is not None}
+    parts = {"reading": columns}
+    if sigmas:
+        parts[SIGMA] = sigmas
+    for choice in columns:
+        if sigmas and choice not in sigmas:
+            raise table.error(f"column {SIGMA}_{choice} is missing beside the others'")
+    own = {name for part in parts.values() for name in part.values()}
+    kept = [place for place, name in enumerate(table.heading) if name not in own]
+    heading = [*(table.heading[place] for place in kept), label]
+    for part, names in parts.items():
+        units = {unit_of(name) for name in names.values()}
+        heading.append(with_unit(part, units.pop()) if len(units) == 1 else part)
+    rows = []
+    for number, row in table.rows:
+        for choice in columns:
+            places = [table.heading.index(part[choice]) for part in parts.values()]
+            for place in places:
+                # A fault is told by the file's own column.
+                table.value(row[place], f"row {number}, column {table.heading[place]}")
+            cells = [row[place] for place in (*kept, *places)]
+            cells.insert(len(kept), choice)
+            rows.append((number, cells))
+    return replace(table, heading=heading, rows=rows)
 
 
 def _knows_rows(model: Measurement, columns: Mapping[Input, str | None]) -> bool:

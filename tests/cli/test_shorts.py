@@ -37,6 +37,10 @@ FILES = {
     "wrong.yaml": "next: {x: x + w}\nnoises: {w: 0.1}\nreadings: {z: x}\ndeviation: {z: 0.5}\n"
     "spread: {x: 2}\n",
     "ode.yaml": "rates: {x: -k*x}\nparameters: {k: 1}\n",
+    "pair.yaml": "rates: {x: a*x, y: -b*y}\nstart: {a: 0.1, b: 0.2}\ninitial: {x: 1, y: 2}\n",
+    "pair.csv": "time,x,y\n1,1.1,1.6\n2,1.2,1.3\n3,1.3,1.1\n",
+    "weighed.csv": "time,x,y,sigma\n1,1.1,1.6,1\n2,1.2,1.3,1\n3,1.3,1.1,1\n",
+    "alone.csv": "time,y\n1,1.6\n2,1.3\n3,1.1\n",
     "warm.csv": "t,volt,temp\n0,1,20\n1,2,21\n2,3.5,22\n",
     "red.yaml": "colour: red\n",
     "bare.csv": "1,2\n3,4\n",
@@ -124,6 +128,20 @@ def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: s
                 "own.yaml": "",
                 "car.yaml": "",
             }.items()
+        ),
+        *(
+            (
+                ["pair.yaml", file, *more],
+                f"measurement=ode measurement.file=pair.yaml {noise} readings='{file}'".replace(
+                    "  ", " "
+                ),
+            )
+            for file, more, noise in [
+                ("pair.csv", [], "noise=unknown noise.by=output"),
+                ("pair.csv", ["noise.deviation=1"], "noise.deviation=1"),
+                ("weighed.csv", [], ""),
+                ("alone.csv", [], ""),
+            ]
         ),
         (["measurement=ranging", "my.csv"], "measurement=ranging readings='my.csv'"),
         (

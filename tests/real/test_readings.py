@@ -99,3 +99,61 @@ def test_the_samples_of_the_readme_are_found_in_any_folder(tmp_path, monkeypatch
     assert [row for _, row in read_tables([named])[0].rows] == [["1", "2"]]
     with pytest.raises(UserError, match="there is no such file"):
         read_tables([named.with_name("other.csv")])
+
+
+GROWTH = {"x": "a*x", "y": "-b*y"}
+
+
+def read_as(folder: Path, text: str, **options):
+    """Readings of two states as a file has them, by their labels."""
+    (folder / "pair.csv").write_text(text, encoding="utf-8")
+    model = ib.measurements.Ode(
+        rates=GROWTH, start={"a": 0.1, "b": 0.2}, initial={"x": 1, "y": 2}, **options
+    )
+    found = open_together([folder / "pair.csv"], model)
+    labels = zip(found.model.index["time"], found.model.index["output"], strict=True)
+    return dict(zip(labels, found.z, strict=True)), found.deviations
+
+
+LONG = "time,output,reading\n1,x,1.1\n1,y,1.6\n2,x,1.2\n2,y,1.3\n3,y,1.1\n"
+
+
+@pytest.mark.parametrize(
+    "wide",
+    [
+        "time,x,y\n1,1.1,1.6\n2,1.2,1.3\n3,,1.1\n",
+        "y,time,x\n1.6,1,1.1\n1.3,2,1.2\n1.1,3,\n",
+        "time;x;y\n1;1,1;1,6\n2;1,2;1,3\n3;;1,1\n",
+        "time,x [kg],y [m]\n1,1.1,1.6\n2,1.2,1.3\n3,,1.1\n",
+    ],
+)
+def test_a_column_for_each_output_is_a_row_for_each_reading(tmp_path, wide):
+    found, _ = read_as(tmp_path, wide)
+    assert np.isnan(found.pop((3.0, "x")))
+    assert found == read_as(tmp_path, LONG)[0]
+
+
+def test_one_of_two_states_is_read_by_its_column_and_the_other_by_none(tmp_path):
+    found, _ = read_as(tmp_path, "time,y\n1,1.6\n2,1.3\n3,1.1\n")
+    assert found == {(1.0, "y"): 1.6, (2.0, "y"): 1.3, (3.0, "y"): 1.1}
+
+
+def test_each_output_has_the_deviations_of_its_column(tmp_path):
+    wide = "time,x,sigma_x,y,sigma_y\n1,1.1,.1,1.6,3\n2,1.2,.2,1.3,4\n"
+    assert read_as(tmp_path, wide)[1].tolist() == [0.1, 3, 0.2, 4]
+    shared = "time,x,y,sigma\n1,1.1,1.6,3\n2,1.2,1.3,4\n"
+    assert read_as(tmp_path, shared)[1].tolist() == [3, 3, 4, 4]
+
+
+@pytest.mark.parametrize(
+    ("wide", "said"),
+    [
+        ("time,x,y\n1,1.1,1.6\n2,1.2,one\n3,1,1.1\n", "row 3, column y: 'one' is not a number"),
+        ("time,x,sigma_x,y\n1,1,1,1\n2,1,1,1\n", "column sigma_y is missing"),
+        ("time,x,y,z\n1,1,1,1\n2,1,1,1\n", "column z is not understood"),
+        ("time,output,reading,y\n1,x,1,1\n2,x,1,1\n", "column y is not understood"),
+    ],
+)
+def test_a_fault_of_such_a_table_is_told_by_its_own_columns(tmp_path, wide, said):
+    with pytest.raises(UserError, match=said):
+        read_as(tmp_path, wide)

@@ -13,7 +13,14 @@ import pandas as pd
 from ipe_bench.measurements.function import title_of
 from ipe_bench.measurements.identifiability import structure
 from ipe_bench.plugins.extensions import richer_models
-from ipe_bench.questions.design.maths import Design, Further, Way, design, entry_in_words
+from ipe_bench.questions.design.maths import (
+    Design,
+    Further,
+    Way,
+    covariance_of,
+    design,
+    entry_in_words,
+)
 from ipe_bench.report.page.writer import write_files
 from ipe_bench.report.tables.table import (
     Column,
@@ -152,9 +159,8 @@ def _draw_design(design: Design) -> Iterator[Drawing]:
     after = None
     title = ""
     if best is not None:
-        scenario = design.scenario
         model = design.measurement(best.sharpest)
-        R = scenario.noise.covariance(model.m)
+        R = covariance_of(design.scenario, model)
         after = Observability.at(model, R, design.x)
         title = f"best choice {best.title}"
     yield from draw_bounds(design.observability, after, title, _where(design))

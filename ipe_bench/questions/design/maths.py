@@ -198,7 +198,7 @@ def design(
             f"noise={noise.name}: the errors of readings are correlated, so that readings do not"
             " add up; a design needs noise=gaussian or noise=quantization"
         )
-    R_all = noise.covariance(candidates.m)
+    R_all = covariance_of(scenario, candidates)
     whole = Observability.at(candidates, R_all, x)
     if not whole.observable:
         return Design(scenario, at, x, criterion, candidates, today, worst, (), lost=lost)
@@ -223,6 +223,18 @@ def design(
         _refuse_few(readings, columns)
     further = _further(scenario, today, point)
     return Design(scenario, at, x, criterion, candidates, today, worst, ways, further, lost)
+
+
+def covariance_of(scenario: Scenario, candidates: Measurement) -> Covariance:
+    """Returns R of candidates: as today's readings of these labels have it, else as new ones
+    would."""
+    labels = zip(*scenario.measurement.index.values(), strict=True)
+    places = {label: place for place, label in enumerate(labels)}
+    rows = [places.get(label) for label in zip(*candidates.index.values(), strict=True)]
+    known = [row for row in rows if row is not None]
+    if len(known) < len(rows):
+        return scenario.noise.covariance(candidates.m)
+    return scenario.problem.R.restricted(np.array(known))
 
 
 def _point(model: Measurement, at: Mapping[str, float] | None) -> Array:

@@ -615,3 +615,33 @@ def test_readings_that_are_nearly_alike_offer_no_choice():
     assert found.ways == ()
     with pytest.raises(ib.UserError, match="do not determine all parameters"):
         ib.design(Scenario(model, Gaussian(0.1), error_scale=0.1), readings=3)
+
+
+@dataclass(frozen=True)
+class Chosen(Linear):
+    """Candidates are today's readings without the first."""
+
+    rows: tuple[int, ...] = (0, 1, 2, 3, 4)
+
+    @property
+    def A(self) -> Array:
+        return super().A[list(self.rows)]
+
+    @property
+    def index(self):
+        return {"number": list(self.rows)}
+
+    @property
+    def candidates(self) -> Measurement:
+        return replace(self, rows=(1, 2, 3, 4))
+
+
+def test_each_candidate_among_todays_readings_keeps_its_own_deviation():
+    deviations = np.array([0.5, 1.0, 2.0, 3.0, 4.0])
+    model = Chosen(most=5)
+    found = design(Scenario(model, Gaussian(tuple(deviations))))
+    best = found.ways[-1].sharpest
+    A = model.A[1:][list(best.rows)] / deviations[1:][list(best.rows), None]
+    after = np.linalg.inv(A.T @ A).diagonal()
+    today = np.linalg.inv((model.A.T / deviations**2) @ model.A).diagonal()
+    assert best.mean_bound == pytest.approx(np.sqrt((after / today).mean()), rel=1e-12)
