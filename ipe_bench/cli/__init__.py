@@ -85,7 +85,7 @@ def places_and_keys(
             raise UserError(f"{command}: {word}: give it a value")
         value: Any = text
         if kinds[key] is NAMES:
-            value = [name.strip() for name in text.strip("[]").split(",") if name.strip()]
+            value = listed(text)
         elif kinds[key] is bool:
             value = {"true": True, "false": False}.get(text, text)
         elif kinds[key] in (float, Count):
@@ -93,6 +93,11 @@ def places_and_keys(
                 value = float(text) if kinds[key] is float else int(text)
         found[key] = checked(value, kinds[key], key)
     return places, found
+
+
+def listed(text: str) -> list[str]:
+    """Returns the names in A,B or [A,B]."""
+    return [name.strip() for name in text.strip("[]").split(",") if name.strip()]
 
 
 def refuse_blanks(words: Sequence[str]) -> None:

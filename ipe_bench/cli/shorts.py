@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 
 from ipe_bench.basics.errors import UserError, did_you_mean, place_of, unknown
 from ipe_bench.basics.files import fault_of
-from ipe_bench.cli import refuse_blanks
+from ipe_bench.cli import listed, refuse_blanks
 from ipe_bench.cli import words as w
 from ipe_bench.cli.spec import KEYS
 from ipe_bench.measurements.arithmetic import parse
@@ -130,7 +130,7 @@ def _kind(word: str) -> str:
 def _typed_files(word: str) -> list[str]:
     """Returns the files of readings=FILE or readings=[A,B]; none of a number."""
     key, _, value = word.partition("=")
-    names = [name.strip(" '\"") for name in value.strip("[]").split(",")]
+    names = [name.strip("'\"") for name in listed(value)]
     if key != "readings" or not all(Path(name).suffix in _DATA for name in names):
         return []
     return names
@@ -300,7 +300,7 @@ class _Reader:
     def _ignored(self) -> list[str]:
         """Lists the columns that are left out."""
         (typed,) = self._typed("ignore_columns") or [""]
-        return [name.strip() for name in typed.strip("[]").split(",") if name.strip()]
+        return listed(typed)
 
     def _typed(self, key: str) -> list[str]:
         """Returns the last value that was typed for a key."""

@@ -50,13 +50,9 @@ class Standing:
     """Whether the columns are ascending error scales, of which it succeeds up to one, rather than
     settings."""
 
-    @property
-    def family(self) -> str:
-        return next((str(row.get("family", "")) for row in self.rows if row), "")
-
-    @property
-    def given(self) -> str:
-        return next((str(row.get("given", "")) for row in self.rows if row), "")
+    def said(self, column: str) -> str:
+        """Returns what a column says of it in every row; empty if none does."""
+        return next((str(row.get(column, "")) for row in self.rows if row), "")
 
     @cached_property
     def sure(self) -> int:
@@ -128,7 +124,7 @@ class Finding:
     @property
     def across(self) -> str:
         """Names those that were given the prior, and others were not; empty if there are none."""
-        more = [one.label for one in self.standings if one.given == _PRIOR]
+        more = [one.label for one in self.standings if one.said("given") == _PRIOR]
         if len(more) in (0, len(self.standings)):
             return ""
         return f"Also given the prior of the truth: {enumerate_few(more, 8)}."
@@ -241,9 +237,9 @@ class Finding:
         """States where the best filters or the best IPE fail, unless both may be among those that
         hold longest."""
         phrases: dict[str, list[Standing]] = {}
-        families = {one.family for one in self.standings}
+        families = {one.said("family") for one in self.standings}
         for side in _SIDES if families.issuperset(_SIDES) else ():
-            own = [one for one in self.standings if one.family == side]
+            own = [one for one in self.standings if one.said("family") == side]
             reach = max(one.possible for one in own)
             for one in own if reach < most else ():
                 if one.possible == reach:

@@ -101,7 +101,7 @@ STATISTICS: tuple[Statistic, ...] = (
         f" share of {GATE:g} of efficient estimates lie in (chi-square quantile); the Bayesian"
         " bound's for estimators that use a prior. Interval: Clopper and Pearson, Biometrika 26,"
         " 1934.",
-        lambda s: int(s.scalars["success"].sum()) / len(s),
+        lambda s: f.share(s.scalars["success"]),
         limits=lambda s: clopper_pearson(int(s.scalars["success"].sum()), len(s)),
         kind="share",
     ),
@@ -111,7 +111,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "The same share with a 95 % interval that stays valid if it is looked at repeatedly and at"
         " any time of stopping, as runs with `precision` do (beta-binomial confidence sequence:"
         " Robbins, Ann. Math. Statist. 41, 1970; Howard et al., Ann. Statist. 49, 2021).",
-        lambda s: int(s.scalars["success"].sum()) / len(s),
+        lambda s: f.share(s.scalars["success"]),
         limits=lambda s: share_sequence(int(s.scalars["success"].sum()), len(s)),
         kind="share",
     ),

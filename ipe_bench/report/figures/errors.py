@@ -14,7 +14,7 @@ from scipy.special import gammainc
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.headline import chosen
-from ipe_bench.report.figures.views import Figure, View, in_focus
+from ipe_bench.report.figures.views import Figure, View, in_focus, only
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, Look, print_width, strong
 from ipe_bench.report.words import brief, enumerate_few, value_text
 
@@ -55,7 +55,7 @@ def draw(view: View) -> Iterator[Drawing]:
     height = max(3.3, 0.17 * len(view.look) + 1.6)
     look = _looks(view) if several else view.look
     hidden = [label for label in look if label not in kept]
-    look = {label: one for label, one in look.items() if label in kept}
+    look = only(look, kept)
     fig, axes = common.panels(count, look, height=height, scales=scales, row=count)
     draw_panels(view, axes, rows, look, scales)
     named = several and not 0 < print_width() < _WIDE

@@ -103,10 +103,8 @@ class View:
     def with_look(self, estimators: Any) -> dict[str, Look]:
         """Returns the looks of those of the estimators that are present, of many in grey but for
         the focus."""
-        present = set(estimators)
         colored = self.focus if len(self.look) > MOST_FACES else self.look
-        look = in_focus(self.look, colored)
-        return {label: one for label, one in look.items() if label in present}
+        return only(in_focus(self.look, colored), set(estimators))
 
     def drawing(self, figure: Canvas, name: str, title: str, *caption: str) -> Drawing:
         """Returns a figure of this setting, whose label stands with the title; empty parts of the
@@ -164,7 +162,6 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
     for key in sorted(settings[:most], key=lambda key: _success(split["summary"][key])):
         setting = dict(zip(columns, key, strict=True))
         frames = {name: split[name].get(key, frame.iloc[:0]) for name, frame in whole.items()}
-        present = set(frames["scores"]["estimator"])
         # An option that this setting does not have is not spoken of.
         own = {column: setting[column] for column in apart if setting[column] != "-"}
         label = _label(setting, own)
@@ -175,7 +172,7 @@ def views(analysis: Analysis, which: Which = "all") -> tuple[list[View], View]:
             suffix=_suffix(own.values(), [part.suffix for part in parts]) if apart else "",
             label=label,
             frames=frames,
-            look={estimator: one for estimator, one in look.items() if estimator in present},
+            look=only(look, set(frames["scores"]["estimator"])),
             equations=equations,
             families=families,
             parameters=footers[key]["parameters"],
@@ -249,6 +246,11 @@ def _looks_by(footers: Mapping[str, Mapping[str, Any]]) -> dict[str, Look]:
     named = [(label, footer.get("look")) for label, footer in footers.items()]
     own = {label: _named(label, look) for label, look in named if look}
     return looks(list(footers), families, own=own)
+
+
+def only(look: Mapping[str, Look], labels: Container[str]) -> dict[str, Look]:
+    """Returns the looks of these labels."""
+    return {label: one for label, one in look.items() if label in labels}
 
 
 def in_focus(look: Mapping[str, Look], colored: Container[str]) -> dict[str, Look]:
