@@ -44,11 +44,11 @@ def one_track(
         return
     parameters = leading.footer["parameters"]
     n = len(parameters)
-    where = {"trial": trial, "at": times}
+    nothing = np.full(len(times), np.nan)
+    where = {"trial": trial, "at": times, "truth": nothing, "deviation": nothing, "across": nothing}
     for number, z in enumerate(true[:, n:].T, 1):
-        nothing = np.full(len(times), np.nan)
-        row = {"parameter": f"reading {number}", "unit": "", "truth": nothing, "mean": z}
-        yield where | {"estimator": READINGS, **row, "deviation": nothing, "across": nothing}
+        name = f"reading {number}"
+        yield where | {"estimator": READINGS, "parameter": name, "unit": "", "mean": z}
     place = position_of([p["name"] for p in parameters])
     for group in groups:
         track = _values(collection, group.cells[0], trial, len(times))
@@ -56,7 +56,7 @@ def one_track(
             continue
         for i, parameter in enumerate(parameters):
             size = parameter["size"]
-            across = np.full(len(times), np.nan)
+            across = nothing
             if place is not None and i == place[0]:
                 across = size * parameters[place[1]]["size"] * track[:, 2 * n]
             yield where | {

@@ -46,7 +46,7 @@ def render_page(
     commands = [command for command in called if command not in (_PYTHON, _UNKNOWN)]
     lead = success(analysis)
     # What the line below the title says is not said again.
-    answer = [part for part in headline(analysis) if not (lead and part == MEANING)]
+    answer = [part for part in headline(analysis) if not lead or part != MEANING]
     # What the matrix shows is not drawn a second time, and the whole table is folded below it.
     tiled = any(isinstance(part, Matrix) for part in answer)
     pictures = [figure for figure in figures if not figure.name.startswith((MATRIX, SUCCESS))]
@@ -70,7 +70,7 @@ def render_page(
     ]
     names = ", ".join(folder.resolve().name or str(folder) for folder in collection.directories)
     title = str(answer.pop(0)).removesuffix(".") if isinstance(answer[0], Strong) else names
-    named = [names] if names and title != names else []
+    named = [names] if names != title else []
     page = Page(
         "report",
         title,
@@ -78,7 +78,7 @@ def render_page(
         [*seen, *opened],
         sections,
         folder="figures/",
-        facts=[*named, *_asked(analysis)],
+        facts=list(filter(None, [*named, *_asked(analysis)])),
         made=_facts(collection),
         lead=lead,
         commands=commands[:MOST_COMMANDS],
@@ -99,13 +99,14 @@ def _asked(analysis: Analysis) -> list[str]:
         who = counted(totals["estimator"].nunique(), "estimator")
         return [who, counted(problems, "problem")]
     numbers = []
-    for column, noun in (("estimator", "estimator"), ("error_scale", "error scale")):
-        if column in totals and len(totals):
-            numbers.append(counted(totals[column].nunique(), noun))
     if len(totals):
         noun = "trial" if totals["trials"].max() == 1 else "trials"
-        numbers.append(f"{from_to(totals['trials'])} {noun} each")
-    return [*numbers, *filter(None, [task(analysis.collection.groups)])]
+        numbers = [
+            counted(totals["estimator"].nunique(), "estimator"),
+            counted(totals["error_scale"].nunique(), "error scale"),
+            f"{from_to(totals['trials'])} {noun} each",
+        ]
+    return [*numbers, task(analysis.collection.groups)]
 
 
 def _facts(collection: Collection) -> list[str]:

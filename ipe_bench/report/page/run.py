@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -98,9 +98,8 @@ class Pending:
         added = [table for section in sections for table in section.tables]
         opening = headline(analysis)
         found = next((str(part) for part in opening if isinstance(part, Strong)), "")
-        matrices = [
-            replace(part, title=part.title or found) for part in opening if isinstance(part, Table)
-        ]
+        shown = [part for part in opening if isinstance(part, Table)]
+        matrices = [replace(table, title=table.title or found) for table in shown]
         files = _write_summaries(analysis.summary, output)
         for table in (*tables, *added, *matrices):
             files += write_table(table, output / "tables", self.formats)
@@ -147,24 +146,24 @@ def _write_summaries(summary: pd.DataFrame, output: Path) -> list[Path]:
 
     main = main_columns(summary)
     is_total = main["parameter"] == ALL
-    files = [output / "summary_all.csv", output / "parameters.csv"]
-    write_text(output / "summary.csv", csv_text(main[is_total]))
-    write_text(files[0], csv_text(summary))
-    write_text(files[1], csv_text(main[~is_total]))
-    return files
+    frames = {"summary": main[is_total], "summary_all": summary, "parameters": main[~is_total]}
+    return _write_frames(frames, output)[1:]
 
 
 def _write_curves(analysis: Analysis, folder: Path) -> list[Path]:
     """Writes the frames of the analysis that are too long for tables."""
     from ipe_bench.report.sections import CURVES
 
-    files = []
-    for name in CURVES:
-        frame = getattr(analysis, name)
-        if len(frame):
-            files.append(folder / f"{name}.csv")
-            write_text(files[-1], csv_text(frame))
-    return files
+    frames = {name: getattr(analysis, name) for name in CURVES}
+    return _write_frames({name: one for name, one in frames.items() if len(one)}, folder)
+
+
+def _write_frames(frames: Mapping[str, pd.DataFrame], folder: Path) -> list[Path]:
+    """Writes each frame as NAME.csv."""
+    files = {folder / f"{name}.csv": frame for name, frame in frames.items()}
+    for file, frame in files.items():
+        write_text(file, csv_text(frame))
+    return list(files)
 
 
 def begin_report(

@@ -63,6 +63,7 @@ _BESIDE = 5
 """Lines of a matrix in a terminal besides its rows."""
 LONG = 12
 """Letters of a setting from which a column has a letter for it, which a note explains."""
+_SIGNS = {OVERCONFIDENT: TOO_SMALL, UNDECIDED: NOT_JUDGED, NO_VERDICT: NOT_JUDGED}
 _COVARIANCE = {
     OVERCONFIDENT: "covariance too small",
     TOO_CAUTIOUS: "covariance too large",
@@ -311,8 +312,7 @@ def _tile(
     if row is None:
         return Tile("–", says=f"{one.label}: no result")
     verdict = row["verdict"]
-    sign = TOO_SMALL if verdict == OVERCONFIDENT else ""
-    sign = NOT_JUDGED if verdict in (UNDECIDED, NO_VERDICT) else sign
+    sign = _SIGNS.get(verdict, "")
     number = share_text(row["success"])
     fails = one.judged[at] != SUCCEEDS
     # A blank in place of a sign keeps numbers below each other.
@@ -327,7 +327,8 @@ def _tile(
     }
     setting, scale = finding.places[at]
     where = f"error scale {value_text(scale)}"
-    where = where if finding.ascending else f"{where}, {setting}"
+    if not finding.ascending:
+        where += f", {setting}"
     says = f"{one.label}, {where}: {_says(row, verdict, moving)}"
     return Tile(text, None, False, number, sign, views["success"].step, fails, views, says)
 
