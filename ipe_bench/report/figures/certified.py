@@ -13,7 +13,7 @@ from ipe_bench.measurements.base import with_unit
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
-from ipe_bench.report.style import BOUND_COLOR, RAMP, ink
+from ipe_bench.report.style import BOUND_COLOR, RAMP
 from ipe_bench.report.words import percent
 from ipe_bench.statistics.certified import certified_table, published_table
 
@@ -62,17 +62,10 @@ def draw_digits(view: View) -> Iterator[Drawing]:
 
 def _draw_cells(ax: Any, digits: pd.DataFrame) -> None:
     """Draws a coloured cell with each number of digits, and the names beside the cells."""
-    import seaborn as sns
-    from matplotlib.colors import BoundaryNorm, ListedColormap
-
-    norm = BoundaryNorm([*_STEPS, 99], len(_STEPS))
-    colors = ListedColormap(list(_STEPS.values()))
-    style: Any = {"cbar": False, "annot": True, "fmt": ".0f", "linewidths": 0.8}
-    sns.heatmap(digits, ax=ax, cmap=colors, norm=norm, **style)
-    for text in ax.texts:
-        reached = [step for step in _STEPS if step <= int(text.get_text())]
-        ground = _STEPS[max(reached)]
-        text.set(color=ink(ground), fontsize=_LETTERS)
+    reached = np.searchsorted(list(_STEPS), digits, side="right") - 1.0
+    words = digits.map("{:.0f}".format)
+    places = pd.DataFrame(reached, digits.index, digits.columns).where(digits.notna())
+    common.tiles(ax, places, list(_STEPS.values()), words, _LETTERS, linewidths=0.8)
     names = [common.text(estimator) for estimator in digits.columns]
     ax.set_xticks(ax.get_xticks(), names, rotation=90, fontsize=_LETTERS)
     middles = np.arange(len(digits)) + 0.5

@@ -17,6 +17,7 @@ from ipe_bench.report.style import (
     GREY,
     SOFT,
     Look,
+    ink,
     print_width,
     strong,
 )
@@ -560,6 +561,21 @@ def _draw_curve(
     own = [artist for artist in ax.get_children() if artist not in before]
     for number, artist in enumerate(own):
         mark_name(ax, artist, name, number)
+
+
+def tiles(
+    ax: Axes, places: Any, colors: Sequence[str], words: Any, letters: float, **style: Any
+) -> None:
+    """Draws a grid of cells in the colours at these places, NaN for none, with words in black or
+    white."""
+    import seaborn as sns
+    from matplotlib.colors import ListedColormap
+
+    style |= {"vmin": 0, "vmax": len(colors), "cmap": ListedColormap(list(colors))}
+    sns.heatmap(places, ax=ax, annot=words, fmt="", cbar=False, **style)
+    grounds = [colors[int(place)] for place in np.ravel(places) if np.isfinite(place)]
+    for text, ground in zip(ax.texts, grounds, strict=True):
+        text.set(color=ink(ground), fontsize=letters)
 
 
 def mark_name(ax: Axes, artist: Artist, name: str, number: int) -> None:

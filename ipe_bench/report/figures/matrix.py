@@ -6,10 +6,11 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any
 
+from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.finding import Finding
-from ipe_bench.report.style import RAMP, ink, print_width
+from ipe_bench.report.style import RAMP, WHITE, print_width
 from ipe_bench.report.tables.matrix import MATRIX, Tile, matrices
 
 WIDTH = 5.0
@@ -23,8 +24,6 @@ _LETTERS = 13
 
 
 def draw(view: View) -> Iterator[Drawing]:
-    import seaborn as sns
-    from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure as Canvas
 
     rows: Any = view.totals.to_dict("records")
@@ -41,24 +40,18 @@ def draw(view: View) -> Iterator[Drawing]:
     figure = Canvas(figsize=(width, small * height), layout="constrained")
     ax = figure.subplots()
     steps = [[_step(tile) for tile in row] for row in tiles]
-    sns.heatmap(
+    words = [[_text(tile) for tile in row] for row in tiles]
+    common.tiles(
+        ax,
         steps,
-        ax=ax,
-        cmap=ListedColormap([*RAMP, "#ffffff"]),
-        vmin=0,
-        vmax=len(RAMP) + 1,
-        annot=[[_text(tile) for tile in row] for row in tiles],
-        fmt="",
-        cbar=False,
+        [*RAMP, WHITE],
+        words,
+        7.5 * small,
         linewidths=1.0,
         linecolor="white",
-        annot_kws={"fontsize": 7.5 * small},
         xticklabels=[column.title for column in columns[1:]],
         yticklabels=names,
     )
-    grounds = [RAMP[step] if step < len(RAMP) else "#ffffff" for row in steps for step in row]
-    for text, ground in zip(ax.texts, grounds, strict=True):
-        text.set_color(ink(ground))
     ax.xaxis.tick_top()
     ax.xaxis.set_label_position("top")
     ax.set_xlabel(matrix.over, fontsize=7.5 * small)
