@@ -221,7 +221,7 @@ def finding(frame: pd.DataFrame) -> str:
         if extents:
             clauses.append(f"{word} in {', '.join(extents)}")
     tested = [_TITLES.get(quantity, quantity) for quantity in by_quantity]
-    nothing = f"no change larger than the margin in {enumerate_few(tested)}"
+    nothing = f"not shown to differ by more than the margin in {enumerate_few(tested)}"
     return f"{_who(frame)}: {'; '.join(clauses) or (nothing if tested else 'not tested')}"
 
 

@@ -202,7 +202,7 @@ def _table(name: str, own: Own, point: Point, number: int) -> Table:
         words("estimator", [one.label for one in claims]),
         words("prior", [one.told for one in claims]),
         texts("keeps track, %" if own.moving else "finds, %", _shares(claims, "finds")),
-        texts("truth in 95 % bars, %", [_holding(one) for one in claims]),
+        texts("covered, %", [_holding(one) for one in claims]),
         words("worst", [one.worst for one in claims]),
         texts("factor", [f"{one.factor:.2g}" for one in claims]),
         texts("cost", [compact(one.cost) for one in claims]),
@@ -227,13 +227,15 @@ def _meaning(own: Own) -> str:
     if own.moving:
         return (
             "keeps track: the last states lie within the gate of the bound, in logs that begin"
-            " where yours does; bars: of the last states, over logs from the model's prior."
-            " factor: by which the bars would be right. All shares are approximate."
+            " where yours does; covered: the truth lies in the 95 % bars of the last states, in"
+            " logs from the model's prior. factor: by which the bars would be right. All shares are"
+            " approximate."
         )
     return (
         "finds: the answer's readings lie closer to the best fit's than noise puts the"
-        " best fit to the truth. bars: 95 % intervals as `estimate` prints them, of the worst"
-        " parameter, with the range that chance leaves. factor: by which they would be right."
+        " best fit to the truth. covered: the truth lies in the 95 % interval that estimate prints,"
+        " of the worst parameter, with the range that chance leaves. factor: by which the interval"
+        " would be right."
         " cost: median evaluations of the model."
         f" Shares are of all {own.trials} data sets, whether the best fit was found or not, and"
         " approximate: the truth is your estimate, which is uncertain too."

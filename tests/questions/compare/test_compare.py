@@ -483,7 +483,7 @@ def test_the_title_has_the_change_or_the_number_of_comparisons(tmp_path):
     assert "worse in mean error (1 of 2 comparisons)" in finding(ib.compare(a, b))
     same = finding(ib.compare(a, store(tmp_path / "c", factor=0.5, draws=1)))
     assert same.startswith(
-        "The second against the first: no change larger than the margin in success, mean"
+        "The second against the first: not shown to differ by more than the margin in success, mean"
     )
     filled = store(a, label="new", factor=0.4)
     assert finding(ib.compare(filled, first="it", second="new")).startswith("new against it: ")
