@@ -8,9 +8,9 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.states.affine_paths import Noise, Tangents
 from ipe_bench.states.algebra import factor, half, lower_solve, triangular
 from ipe_bench.states.base import Paths, StateModel
-from ipe_bench.states.chains import Noise, Tangents
 from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.trackers import Tracks, filtered, smoothed
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, Mask, finite, multiply
 from ipe_bench.engine.rows import products
+from ipe_bench.states.affine_paths import Given, Noise, Tangents
 from ipe_bench.states.algebra import (
     Half,
     factor,
@@ -19,7 +20,6 @@ from ipe_bench.states.algebra import (
     triangular,
 )
 from ipe_bench.states.base import StateModel
-from ipe_bench.states.chains import Given, Noise, Tangents
 from ipe_bench.states.steps import BEYOND
 
 _REACHED = 1e-9

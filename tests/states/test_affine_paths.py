@@ -9,7 +9,7 @@ import pytest
 from shared.by_numpy import by_numpy
 from shared.oracles import assert_agrees
 
-from ipe_bench.states.chains import Noise, Tangents
+from ipe_bench.states.affine_paths import Noise, Tangents
 
 _N, _M, _EPOCHS = 3, 2, 6
 
