@@ -69,7 +69,7 @@ class Noise:
         if damping is None or not damping.any():
             return self._states(of, *given)
         # An undamped trial has the same bits beside damped ones.
-        damped: Mask = damping.any(axis=(1, 2))
+        damped = np.asarray(damping.any(axis=(1, 2)))
         plain = ~damped
         x = np.empty(a.shape)
         x[damped] = self._states(of, *_rows(damped, *given, np.sqrt(damping)))
