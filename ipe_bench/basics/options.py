@@ -202,6 +202,9 @@ def checked(value: Any, hint: Any, key: str) -> Any:
     arguments = typing.get_args(hint)
     if hint is Any or isinstance(hint, typing.TypeVar):
         return value
+    # NumPy's numbers, truths and texts are as good as Python's.
+    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.ndim == 0):
+        value = value.item()
     if origin is Annotated:
         return _constrained(value, arguments[0], arguments[1:], key)
     if origin in (typing.Union, types.UnionType):

@@ -11,7 +11,7 @@ import functools
 import importlib
 import itertools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores
 from ipe_bench.engine import compiled
@@ -44,10 +45,15 @@ _ARGUMENTS = tuple(INTEGER if place in _INTEGERS else POINTER for place in range
 
 
 def threads() -> int:
-    """Threads that one integration may use: `IPE_BENCH_THREADS`, else every core of this
-    process."""
+    """Returns the number of threads that one integration may use: `IPE_BENCH_THREADS`, else every
+    core of this process."""
     chosen = os.environ.get("IPE_BENCH_THREADS")
-    return max(1, int(chosen)) if chosen else cores()
+    if not chosen:
+        return cores()
+    try:
+        return max(1, int(chosen))
+    except ValueError:
+        raise UserError(f"IPE_BENCH_THREADS={chosen}: give a whole number above 0") from None
 
 
 @functools.cache
@@ -121,45 +127,54 @@ class Kernel:
         lanes = len(rows) * count
         if not lanes:
             return
-        # The frame is as wide as the lanes need.
-        function, size = self._narrow if lanes <= _NARROW else self._wide
-        given = (at(x), at(si), at(cases), count, at(rows, WHOLE))
         *offset, out = more
         stride = 0
         subtracted = None
         if offset:
             stride = len(offset[0]) // count
             subtracted = at(offset[0])
-        taken = (at(times), at(steps, WHOLE), len(times), subtracted, stride, at(out))
+        problems = (at(x), at(si), at(cases), count, at(rows, WHOLE))
+        results = (at(times), at(steps, WHOLE), len(times), subtracted, stride, at(out))
         kept = None if states is None else at(states)
+        # The frame is as wide as the lanes need.
+        function, size = self._narrow if lanes <= _NARROW else self._wide
 
-        def work_on(pieces: Sequence[tuple[int, int]] | Any) -> None:
+        def work_on(pieces: Iterable[tuple[int, int]]) -> None:
             memory, frame = aligned(size)
             for first, last in pieces:
-                function(*given, first, last, *taken, kept, frame)
+                function(*problems, first, last, *results, kept, frame)
+            # Until here the frame lies in this memory.
             del memory
 
-        # Work in steps times lanes times states; a Jacobian costs a tangent for each parameter.
-        width = compiled.width()
-        full = lanes // width
-        stepped = lanes * int(steps[: len(times)].sum())
-        work = stepped * self.equations.states
-        if not offset:
-            work *= x.shape[1]
+        work = self._work(x, lanes, steps[: len(times)])
+        full = lanes // compiled.width()
         workers = min(threads(), full) if work >= _WORTH_THREADS else 1
         if workers <= 1:
             work_on([(0, lanes)])
             return
-        # More pieces than threads, so that a core slowed by other work does not hold up the rest.
-        each = min(4, max(1, work // _WORTH_THREADS))
-        shares = min(full, workers * each)
-        bounds = [width * (i * full // shares) for i in range(shares)]
-        pieces = iter(list(itertools.pairwise([*bounds, lanes])))
+        # Threads take one piece after another from one iterator.
+        pieces = iter(_pieces(lanes, work, workers))
         pool = _pool(workers - 1, os.getpid())
         others = [pool.submit(work_on, pieces) for _ in range(workers - 1)]
         work_on(pieces)
         for other in others:
             other.result()
+
+    def _work(self, x: Array, lanes: int, steps: Integers) -> int:
+        """Returns steps times lanes times states; a Jacobian costs a tangent for each parameter."""
+        work = lanes * int(steps.sum()) * self.equations.states
+        return work * x.shape[1] if self.sensitive else work
+
+
+def _pieces(lanes: int, work: int, workers: int) -> list[tuple[int, int]]:
+    """Cuts lanes into whole vectors: more pieces than threads, so that a core slowed by other work
+    does not hold up the rest."""
+    width = compiled.width()
+    full = lanes // width
+    each = min(4, max(1, work // _WORTH_THREADS))
+    shares = min(full, workers * each)
+    bounds = [width * (i * full // shares) for i in range(shares)]
+    return list(itertools.pairwise([*bounds, lanes]))
 
 
 def compiled_rates(program: Program) -> Callable[[Array, Array, Array], None]:

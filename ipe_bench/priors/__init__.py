@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -88,32 +89,8 @@ class GaussianPrior(Prior):
         super().__post_init__()
         if self.deviations is not None and not any(self.deviations):
             raise UserError("deviations: give at least one that is above 0")
-        rows = self.correlations or ()
-        for i, row in enumerate(rows, start=1):
-            if len(row) != len(rows):
-                raise UserError(
-                    f"correlations: row {i} has {len(row)} numbers; give a square matrix,"
-                    f" {len(rows)} in each row"
-                )
         if self.correlations is not None:
-            C = np.array(self.correlations)
-            if not np.allclose(np.diag(C), 1.0, atol=_SYMMETRIC):
-                raise UserError(
-                    "correlations: has a diagonal that is not 1; give correlations, deviations"
-                    " aside"
-                )
-            if (np.abs(C - C.T) > _SYMMETRIC).any():
-                i, j = np.unravel_index(np.abs(C - C.T).argmax(), C.shape)
-                raise UserError(
-                    f"correlations: is not symmetric; row {i + 1}, column {j + 1} is {C[i, j]:g},"
-                    f" and row {j + 1}, column {i + 1} is {C[j, i]:g}"
-                )
-            least = float(np.linalg.eigvalsh((C + C.T) / 2)[0])
-            if least <= _DEFINITE:
-                raise UserError(
-                    f"correlations: is not positive definite; the least eigenvalue is {least:.2g},"
-                    " so that some combination of the parameters would have no variance"
-                )
+            _check_correlations(self.correlations)
 
     def deviation(self, n: int, error_scale: float) -> Array:
         if self.deviations is not None and len(self.deviations) != n:
@@ -121,9 +98,8 @@ class GaussianPrior(Prior):
                 f"prior.deviations: has {len(self.deviations)} numbers; give one for each of {n}"
                 " parameters"
             )
-        return error_scale * (
-            np.ones(n) if self.deviations is None else np.asarray(self.deviations, dtype=float)
-        )
+        of_each = np.ones(n) if self.deviations is None else np.array(self.deviations)
+        return error_scale * of_each
 
     def correlation(self, n: int) -> Array | None:
         if self.correlations is None:
@@ -138,9 +114,38 @@ class GaussianPrior(Prior):
 
     def draw(self, x0: Array, error_scale: float, rng: np.random.Generator) -> Array:
         n = len(x0)
-        drawn = rng.standard_normal(n)
+        white = rng.standard_normal(n)
         C = self.correlation(n)
-        if C is not None:
-            white = drawn
-            drawn = np.linalg.cholesky(C) @ white
+        drawn = white if C is None else np.linalg.cholesky(C) @ white
         return x0 + self.deviation(n, error_scale) * drawn
+
+
+def _check_correlations(rows: Sequence[Sequence[float]]) -> None:
+    """Refuses what is no correlation matrix: square, of diagonal 1, symmetric, positive
+    definite."""
+    if not rows:
+        raise UserError("correlations: is empty; give a square matrix, a row for each parameter")
+    for number, row in enumerate(rows, start=1):
+        if len(row) != len(rows):
+            raise UserError(
+                f"correlations: row {number} has {len(row)} numbers; give a square matrix,"
+                f" {len(rows)} in each row"
+            )
+    C = np.array(rows)
+    if not np.allclose(np.diag(C), 1.0, atol=_SYMMETRIC):
+        raise UserError(
+            "correlations: has a diagonal that is not 1; give correlations, deviations aside"
+        )
+    gap = np.abs(C - C.T)
+    if (gap > _SYMMETRIC).any():
+        i, j = np.unravel_index(gap.argmax(), C.shape)
+        raise UserError(
+            f"correlations: is not symmetric; row {i + 1}, column {j + 1} is {C[i, j]:g},"
+            f" and row {j + 1}, column {i + 1} is {C[j, i]:g}"
+        )
+    least = float(np.linalg.eigvalsh((C + C.T) / 2)[0])
+    if least <= _DEFINITE:
+        raise UserError(
+            f"correlations: is not positive definite; the least eigenvalue is {least:.2g},"
+            " so that some combination of the parameters would have no variance"
+        )

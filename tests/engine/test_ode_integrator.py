@@ -13,8 +13,15 @@ from shared.slopes import differentiate
 from ipe_bench.basics.errors import UserError
 from ipe_bench.engine import tableaus
 from ipe_bench.engine.coarseness import tangent_contraction
+from ipe_bench.engine.integrator import threads
 from ipe_bench.engine.trace import Graph
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
+
+
+def test_a_number_of_threads_that_is_none_is_refused(monkeypatch):
+    monkeypatch.setenv("IPE_BENCH_THREADS", "two")
+    with pytest.raises(UserError, match="IPE_BENCH_THREADS=two: give a whole number"):
+        threads()
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,26 @@ def test_a_choice_is_one_of_its_own_type():
             checked(value, Literal[1, 2], "start")
 
 
+@pytest.mark.parametrize(
+    ("value", "hint", "kept"),
+    [
+        (np.True_, bool, True),
+        (np.int64(2), Literal[1, 2], 2),
+        (np.array(2.0), float, 2.0),
+        (np.str_("a"), str, "a"),
+    ],
+)
+def test_a_single_value_of_numpy_is_as_good_as_one_of_python(value, hint, kept):
+    found = checked(value, hint, "key")
+    assert found == kept
+    assert type(found) is type(kept)
+
+
+def test_an_array_that_is_one_number_is_no_list():
+    with pytest.raises(UserError, match=r"^key=1.0: give a list$"):
+        checked(np.array(1.0), tuple[float, ...], "key")
+
+
 def test_an_entry_of_a_list_is_named_by_its_place():
     with pytest.raises(UserError, match=r"^beacons\[1\]\[2\]=up: give a number$"):
         Ranging(beacons=((0.0, 0.0, 1.0), (0.0, 0.0, "up")))  # type: ignore[arg-type]

@@ -100,6 +100,7 @@ REFUSED = {
     "not definite": (((1, 1.1), (1.1, 1)), r"is not positive definite; the least eigenvalue"),
     "singular": (((1, 1), (1, 1)), r"is not positive definite"),
     "not square": (((1, 0, 0), (0, 1, 0)), r"row 1 has 3 numbers; give a square matrix"),
+    "nothing": ((), r"is empty; give a square matrix"),
     "no correlations": (((4, 0), (0, 1)), r"has a diagonal that is not 1"),
 }
 
