@@ -13,11 +13,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.linalg import Array, multiply, own
 from ipe_bench.engine.rows import RowFunction
 from ipe_bench.engine.scan import Step, gram
 from ipe_bench.engine.trace import RowPrograms
@@ -52,6 +52,8 @@ _MOST_OPERATIONS = 20_000
 machine."""
 _NUMBERS = 4e6
 """Numbers of passes that are held at once."""
+_NUMBERS_BY_EPOCH = 2e7
+"""Numbers likewise where functions are called epoch by epoch: each call is of all trials."""
 _LANES = 8
 """Trials at least that are held at once: machine code takes no more time for them than for one."""
 
@@ -327,6 +329,8 @@ class Passed(NamedTuple):
 class Passes(ABC):
     """Passes along a model's epochs, there and back."""
 
+    numbers: ClassVar[float] = _NUMBERS
+
     def __init__(self, model: StateModel, kind: Kind) -> None:
         self.model = model
         self.functions = model.epoch_functions
@@ -343,8 +347,10 @@ class Passes(ABC):
     @property
     def at_once(self) -> int:
         """Trials that are run together at most."""
-        numbers = (1 + self.model.epochs) * (self.sizes.shown.size + self.sizes.back.size)
-        return max(_LANES, int(_NUMBERS / numbers))
+        each = self.sizes.shown.size
+        if self.kind.smooths:
+            each += self.sizes.back.size
+        return max(_LANES, int(self.numbers / ((1 + self.model.epochs) * each)))
 
     @cached_property
     def _back(self) -> Step:
@@ -452,6 +458,8 @@ class _States(NamedTuple):
 class _ByEpoch(Passes):
     """Passes whose functions are called epoch by epoch, and linearised by the rule in NumPy."""
 
+    numbers = _NUMBERS_BY_EPOCH
+
     def __init__(self, model: StateModel, kind: Kind) -> None:
         super().__init__(model, kind)
         self._step = functools.cache(self._made)
@@ -463,17 +471,18 @@ class _ByEpoch(Passes):
         m = self.sizes.m
         smooths = self.sizes.smooths
         if text is _move:
-            each = Layout(y=n, AF=full(n, n), N=full(n, columns))
+            each = {"y": n, "AF": full(n, n), "N": full(n, columns)}
             shown = self.sizes.moved if smooths else _NOTHING
         else:
-            each = Layout(z=m, y=m, HF=full(m, n), M=full(m, columns), H=full(m, n))
+            each = {"z": m, "y": m, "HF": full(m, n), "M": full(m, columns), "H": full(m, n)}
             shown = self.sizes.shown
         options: dict[str, Any] = {"smooths": smooths}
         if gate is not None:
             options["gate"] = gate
         recorded = partial(text, **options)
         what = text.__name__, options
-        return named_step(recorded, what, self.sizes.carried, [each], _NOTHING, shown)
+        arrays = [Layout(**{name: shape}) for name, shape in each.items()]
+        return named_step(recorded, what, self.sizes.carried, arrays, _NOTHING, shown)
 
     def there(self, z: Array, route: Route | None, carry: Array, shown: Array) -> None:
         n = self.sizes.n
@@ -557,10 +566,9 @@ class _ByEpoch(Passes):
     ) -> Array:
         trials = len(carry)
         step = self._step(text, noise.shape[2], gate)
-        parts = [part.reshape(trials, -1) for part in (*before, noise, *after)]
-        each = np.concatenate(parts, axis=1)[:, None]
+        each = [own(part).reshape(trials, 1, -1) for part in (*before, noise, *after)]
         out = np.empty((trials, 1, step.shown))
-        step.run(carry, [each], _NONE, out, 0, 1, 1)
+        step.run(carry, each, _NONE, out, 0, 1, 1)
         return out[:, 0]
 
 
