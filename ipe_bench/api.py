@@ -136,12 +136,12 @@ def load(directories: Directories) -> pd.DataFrame:
     Returns:
         A row per trial and estimator: measurement, noise, prior, error_scale, seed, estimator, and
         every key of the config that differs; trial, status, success, solved, `error_NAME`,
-        `crlb_distance` (the squared Mahalanobis distance by the bound at the truth, of a folded
-        scalar state by its exact posterior), nees, fit_p,
-        iterations, simulations, jacobians, time_s, message, the truth `x_NAME`, `deviation_NAME` as
-        the estimator reports it, the bounds `crlb_NAME` and `bayes_NAME`, in multiples of the
-        parameters' sizes; columns that only some rows have come last. A warning names what is
-        missing or damaged; stale results are left out.
+        `crlb_distance` (the squared Mahalanobis distance by the bound at the truth, of a scalar
+        state of a curved model by its exact posterior), nees, fit_p, iterations, simulations,
+        jacobians, time_s, message, the truth `x_NAME`, `deviation_NAME` as the estimator reports
+        it, the bounds `crlb_NAME` and `bayes_NAME`, in multiples of the parameters' sizes; columns
+        that only some rows have come last. A warning names what is missing or damaged; stale
+        results are left out.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)

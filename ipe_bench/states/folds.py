@@ -29,7 +29,10 @@ _ROUND = 0.6
 """Part of its period through which a reading that comes round goes between these points at least:
 states a period apart are then 6.7 standard deviations apart at most, and both may be probable."""
 _POINTS = 200
-"""Points of the grid of an epoch at least."""
+"""Points of the grid of an epoch at least; as many take half a millisecond a trial of 20 epochs, a
+fine one may take a second."""
+_STRAIGHT = 1e-9
+"""Part by which slopes of a straight line differ at most."""
 
 
 def may_fold(model: StateModel) -> bool:
@@ -43,16 +46,22 @@ def exact_tracks(
     filtered: Tracks,
     smooths: bool = True,
     gate: float | None = None,
+    *,
+    of_all: bool = False,
 ) -> tuple[Tracks, NDArray[np.intp]]:
     """Returns the tracks of a grid of those trials whose readings are folded among the states that
     the extended filter predicts, if a grid is exact for them, and which trials these are; readings
-    beyond a quantile `gate` are missing."""
+    beyond a quantile `gate` are missing. `of_all` asks for all trials of a model that is not
+    straight and for which `_POINTS` are enough."""
     if not may_fold(model):
         return Tracks.empty(model, 0), np.arange(0)
     is_open = folded(model, filtered)
     if Filter().hindrance(model):
         # A filter takes nothing from such readings.
         is_open[:] = True
+    if of_all and not straight(model, filtered):
+        grid = grid_of(model, smooths)
+        is_open |= grid is not None and grid.points == _POINTS
     rows = np.flatnonzero(is_open)
     grid = grid_of(model, smooths) if rows.size else None
     if grid is None:
@@ -91,6 +100,22 @@ def folded(model: StateModel, filtered: Tracks) -> Mask:
     bent = (steepest > _SEEN * deviation.min(axis=0)) & ~(least >= _EVEN * steepest)
     unlike = deviation.max(axis=0) > _NOISES * deviation.min(axis=0)
     return (seen & (bent | unlike | (turns > _ROUND))).any(axis=(1, 2))
+
+
+def straight(model: StateModel, filtered: Tracks) -> bool:
+    """Tells whether transitions and readings are straight lines among the states of a filter, with
+    the same noise at all of them."""
+    if model.gain_by_state or model.R_by_state:
+        return False
+    path, P = whole(filtered)
+    spread = np.sqrt(P[..., 0])
+    f, h = model.epoch_functions
+    for function, x, far in ((f, path[:, :-1], spread[:, :-1]), (h, path[:, 1:], spread[:, 1:])):
+        slopes = np.array([function.slopes(x + at * far)[1] for at in _AMONG])
+        # Of a state that is not a number nothing is known.
+        if not np.ptp(slopes, axis=0).max() <= _STRAIGHT * np.abs(slopes).max():
+            return False
+    return True
 
 
 def calls(model: StateModel) -> float:

@@ -162,9 +162,9 @@ class PathBlock:
         return np.ascontiguousarray(np.diagonal(P, axis1=2, axis2=3))
 
     def gates(self, smooths: bool) -> Array:
-        """The variances (trials, K, n) against which errors are held: of each trial's exact
-        posterior where the reading of a scalar state is folded, which no linear bound describes,
-        else of the bound."""
+        """The variances (trials, K, n) against which errors are held: of a scalar state those of
+        each trial's exact posterior, which no linear bound describes where the reading is folded,
+        unless a grid would be very fine and the reading is not folded; else of the bound."""
         if smooths not in self._gates:
             self._gates[smooths] = self._gates_of(smooths)
         return self._gates[smooths]
@@ -176,7 +176,8 @@ class PathBlock:
             return bound
         z = self.paths.z
         with np.errstate(all="ignore"):
-            exact, rows = exact_tracks(model, z, filtered(model, z, Taylor()), smooths)
+            first = filtered(model, z, Taylor())
+            exact, rows = exact_tracks(model, z, first, smooths, of_all=True)
         return put(bound, rows, exact.covariance[..., 0])
 
     @cached_property

@@ -24,6 +24,7 @@ from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import options
 from ipe_bench.states import (
     Cubature,
+    Formulas,
     Grid,
     IteratedSmoother,
     LevenbergMarquardtSmoother,
@@ -352,6 +353,29 @@ def test_errors_of_a_folded_scalar_state_are_held_against_its_exact_posterior(sm
     error = columns["error_x"] ** 2 / exact.covariance[:, -1, 0, 0]
     np.testing.assert_allclose(columns["crlb_distance"], error, rtol=1e-3)
     np.testing.assert_array_equal(columns["success"], error <= gate(1))
+
+
+@pytest.mark.parametrize("smooths", [False, True])
+@pytest.mark.parametrize(
+    ("moved", "reading"), [("3*sin(x) + w", "x"), ("0.9*x + w", "exp(x/2)")], ids=["moved", "read"]
+)
+def test_errors_of_any_curved_scalar_state_are_held_against_its_exact_posterior(
+    moved, reading, smooths
+):
+    """Though its reading does not turn back among the states that a filter predicts."""
+    model = Formulas(
+        next={"x": moved},
+        readings={"z": reading},
+        noise={"w": 0.3},
+        deviation={"z": 1.0},
+        spread={"x": 1.0},
+        count=20,
+    )
+    block = PathBlock.draw(StateScenario(model, seed=1), 0, 60)
+    exact = Grid(500, smooths).track(model, block.paths.z)
+    np.testing.assert_allclose(block.gates(smooths), exact.covariance[..., 0], rtol=1e-4)
+    assert not np.allclose(block.gates(False), block.variances, rtol=0.1)
+    assert block.estimate(Grid(500, smooths))[1]["success"].all()
 
 
 def test_errors_of_an_even_scalar_state_are_held_against_the_bound():

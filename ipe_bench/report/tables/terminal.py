@@ -75,9 +75,8 @@ _TOLD = (
 TRACKED = (
     "All columns are for the last time step, where filters and smoothers have the same readings."
     " Success: the error lies in the gate (all but one in a million) of a filter"
-    " linearised at the true path, or of the exact density where the reading of a single state"
-    " turns back. For whole paths see the table of all time steps. Cost: evaluations"
-    " of transition and reading."
+    " linearised at the true path, or of the exact density of a single state of a curved model."
+    " For whole paths see the table of all time steps. Cost: evaluations of transition and reading."
 )
 """References of a track's errors."""
 _NAMED = ("measurement", "noise")
