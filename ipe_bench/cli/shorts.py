@@ -377,13 +377,24 @@ class _Reader:
             f" needed: {self._again(self._ignoring(unused))}"
         )
 
-    def _noise(self) -> str:
+    def _levels(self, read: Sequence[str]) -> list[str]:
+        """Returns the words by which each of several columns of readings has a noise level of its
+        own, unless noise is stated."""
+        stated = any(word.startswith("noise") for word in self.others)
+        if stated or not {SIGMA, f"{SIGMA}_{read[0]}"}.isdisjoint(self.columns):
+            return []
+        return ["noise=unknown", "noise.by=output"]
+
+    def _noise(self, levels: Sequence[str] = ()) -> str:
         """Says what is taken for the noise of an estimate; other commands say it with its size."""
         stated = any(word.startswith("noise") for word in self.others)
         if stated or self.command != "estimate":
             return ""
-        if SIGMA in self.columns:
-            return "Noise: standard deviations from column sigma."
+        if levels:
+            return "Noise: a level for each of these columns, estimated from its residuals."
+        deviations = [name for name in self.columns if name.startswith(SIGMA)]
+        if deviations and (SIGMA in deviations or deviations[1:]):
+            return f"Noise: standard deviations from column {enumerate_few(deviations)}."
         return "Noise: one level, estimated from the residuals; noise.deviation=X states it."
 
     # Functions
@@ -421,15 +432,47 @@ class _Reader:
                 f" {', '.join(self.columns)}{near}); rename the column, or give a parameter its"
                 f" start: as a default in {file}, or by {self._again(*starts)}"
             )
-        reading = self._reading(what, wanted, ["reading"])
         words = ["measurement=function", f"measurement.of={module}:{chosen.name}"]
-        words += _reading_word(reading, ("reading",))
         shown = {one.arg: {**starts, **typed}.get(one.arg, "") for one in arguments}
         shown = {name: value for name, value in shown.items() if value}
         self._refuse_bare([one.arg for one in arguments])
         model = f"Model: {what} of {file}{_values(shown)}."
+        read = self._outputs(chosen, what, wanted)
+        if read:
+            levels = self._levels(read)
+            words += [f"measurement.outputs=[{','.join(map(w.quoted, read))}]", *levels]
+            readings = f"Readings: columns {enumerate_few(read)} of {', '.join(self.files)}"
+            readings += f", in the order in which {chosen.name} returns them."
+            return self._short(words, [model, readings, self._noise(levels)])
+        reading = self._reading(what, wanted, ["reading"])
+        words += _reading_word(reading, ("reading",))
         told = [model, self._told(wanted, reading), self._noise()]
         return self._short(words, told, self._remarks(wanted, reading))
+
+    def _outputs(self, chosen: ast.FunctionDef, what: str, taken: Sequence[str]) -> list[str]:
+        """Finds the column of each array that a function returns in a tuple; none for one array."""
+        last = chosen.body[-1]
+        if not (isinstance(last, ast.Return) and isinstance(last.value, ast.Tuple)):
+            return []
+        typed = self._typed("measurement.outputs")
+        if typed:
+            return [name.strip() for name in typed[0].strip("[]").split(",")]
+        arrays = last.value.elts
+        free = [name for name in self._free(taken) if not name.startswith(f"{SIGMA}_")]
+        names = [one.id for one in arrays if isinstance(one, ast.Name)]
+        if len(names) == len(arrays) and {*names} <= {*free}:
+            unused = [name for name in free if name not in names]
+            if unused:
+                self._refuse_unused(what, unused, [*taken, *names])
+            return names
+        if len(free) == len(arrays):
+            return free
+        example = ",".join([*free, *["NAME"] * len(arrays)][: len(arrays)])
+        raise UserError(
+            f"{self.files[0]}: {what} returns {len(arrays)} arrays, and columns"
+            f" {enumerate_few(free) or 'none'} are left for them; name theirs in order:"
+            f" {self._again(f'measurement.outputs=[{example}]')}"
+        )
 
     @property
     def _started(self) -> dict[str, str]:
@@ -549,18 +592,13 @@ class _Reader:
             words = ["measurement=ode", f"measurement.file={file}"]
             words += _title("measurement", file, content)
             model = f"Model: differential equations of {file}."
-            read = [
-                name for name in content.get("outputs", content["rates"]) if name in self._free([])
-            ]
+            outputs = content.get("outputs", content["rates"])
+            read = [name for name in outputs if name in self._free([])]
             if "output" in self.columns or len(read) < 2:
                 return self._short(words, [model, f"Readings: {files}.", self._noise()])
+            levels = self._levels(read)
             readings = f"Readings: columns {enumerate_few(read)} of {files}."
-            stated = any(word.startswith("noise") for word in self.others)
-            if stated or not {SIGMA, f"{SIGMA}_{read[0]}"}.isdisjoint(self.columns):
-                return self._short(words, [model, readings])
-            words += ["noise=unknown", "noise.by=output"]
-            noise = "Noise: a level for each of these columns, estimated from its residuals."
-            return self._short(words, [model, readings, noise])
+            return self._short([*words, *levels], [model, readings, self._noise(levels)])
         there = f"its keys are {', '.join(map(str, keys))}" if keys else "it has no keys"
         raise UserError(
             f"{file}: is no model: it has neither next: (a state model by formulas) nor rates:"
@@ -572,7 +610,7 @@ class _Reader:
         typed = self._typed("state_model.inputs.time") or self._typed("state_model.step")
         told = typed or "step" in content or "time" in content.get("inputs", {})
         clock = {"t", "dt"} & set(_names(content)) - _defined(content)
-        return bool(clock) and "time" in self._free([]) and not told
+        return bool(clock) and "time" in {*self.columns} - {*self._ignored} and not told
 
     def _require_complete(self, file: str, content: dict[str, Any], group: str, cls: type) -> None:
         """Refuses a file with keys that mean nothing, or without those that are needed."""

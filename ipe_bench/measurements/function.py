@@ -21,7 +21,7 @@ from ipe_bench.basics.errors import UserError, place_of, refuse_unknown, unknown
 from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.options import Finite, Positive
 from ipe_bench.functions.judged import Judged, judged
-from ipe_bench.measurements.base import Forwarding, Measurement
+from ipe_bench.measurements.base import Forwarding, Input, Measurement
 from ipe_bench.measurements.formula import Formula, WrittenModel
 
 _CHUNK = 8
@@ -44,10 +44,11 @@ class Function(WrittenModel):
 
     Arguments with a number as default are parameters, which start there; arguments without are
     columns of the readings file, arrays (m,); keyword-only arguments are constants. h returns the
-    readings (m,). The type `Annotated[float, "m"]` gives a parameter its unit. Slopes are exact: by
-    forward differentiation where h returns JAX arrays, by a complex step where differences do not
-    contradict it, else by differences that know their error. Readings that have a column `t` or
-    `time` arrive in that order, so that filters take part.
+    readings (m,), or a tuple of arrays (m,), which `outputs` names. The type
+    `Annotated[float, "m"]` gives a parameter its unit. Slopes are exact: by forward differentiation
+    where h returns JAX arrays, by a complex step where differences do not contradict it, else by
+    differences that know their error. Readings that have a column `t` or `time` arrive in that
+    order, so that filters take part.
     """
 
     of: str
@@ -72,8 +73,12 @@ class Function(WrittenModel):
     unit: str = ""
     """Unit of the readings."""
     circular: tuple[str, ...] = ()
-    """The readings' name if they are angles, in rad, or in deg by their unit: residuals are within
-    half a turn."""
+    """The readings' name, or those of outputs, if they are angles, in rad, or in deg by their unit:
+    residuals are within half a turn."""
+    outputs: tuple[str, ...] = ()
+    """Names of the arrays, if h returns a tuple of them."""
+    output: tuple[str, ...] = ()
+    """The output that each reading is of; none: all are read in every row of the columns."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,7 +106,21 @@ class Function(WrittenModel):
             if name not in self.columns:
                 remedy = f"give measurement.columns.{name}=[...], or measurement.start.{name}=VALUE"
                 raise UserError(f"columns: {name} is missing; {remedy}")
-        self.require_columns_and_parameters("size", "units")
+        self.require_columns_and_parameters("size", "units", readings=self.outputs)
+        for name in self.output:
+            refuse_unknown(f"output={name}", name, self.outputs, "output")
+        if self.outputs and not self.headings:
+            raise UserError(f"outputs: {self.of} takes no column; return one array of all readings")
+        if self.outputs and self.columns and not self.output:
+            self._read_all()
+
+    def _read_all(self) -> None:
+        """Gives each output a reading in every row of the columns."""
+        k = len(self.outputs)
+        columns = {name: np.repeat(self.column(name), k).tolist() for name in self.headings}
+        rows = len(self.column(self.headings[0]))
+        object.__setattr__(self, "columns", columns)
+        object.__setattr__(self, "output", self.outputs * rows)
 
     if typing.TYPE_CHECKING:
         function: typing.ClassVar[Callable[..., Any]]
@@ -190,7 +209,23 @@ class Function(WrittenModel):
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Function:
         numbers = {name: tuple(map(float, columns[name])) for name in self.headings}
-        return replace(self, columns=numbers)
+        return replace(self, columns=numbers, output=tuple(columns.get("output", ())))
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        if not self.outputs:
+            return super().inputs
+        return (*super().inputs, Input("output", str, label=True, choices=self.outputs))
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        return super().input_columns | ({"output": self.output} if self.outputs else {})
+
+    @property
+    def periods(self) -> Array | Sequence[float]:
+        if not self.outputs or not self.circular:
+            return super().periods
+        return np.where(np.isin(self.output, self.circular), self.turn, 0.0)
 
     @cached_property
     def m(self) -> int:
@@ -220,7 +255,7 @@ class Function(WrittenModel):
         known = self._known
         parameters = dict(zip(self.starts, values, strict=True))
         try:
-            return self.function(**parameters, **known)
+            found = self.function(**parameters, **known)
         except (Exception, SystemExit) as error:
             if np.iscomplexobj(values):  # functions of `math` refuse them
                 return self._at(values.real)
@@ -232,6 +267,21 @@ class Function(WrittenModel):
                     " write np.exp in place of math.exp, and so on"
                 )
             raise UserError(f"measurement.of={self.of}: {place_of(error, file)}{remedy}") from error
+        return self._read(found) if self.outputs else found
+
+    def _read(self, found: Any) -> Any:
+        """Takes each reading (m,) from the array of its output."""
+        if not isinstance(found, tuple | list) or len(found) != len(self.outputs):
+            raise UserError(
+                f"measurement.of={self.of}: outputs names {len(self.outputs)} arrays; let it return"
+                " a tuple of them"
+            )
+        of_jax = type(found[0]).__module__.startswith("jax")
+        where = sys.modules["jax"].numpy.where if of_jax else np.where
+        z = self._checked(found[0], self.m)
+        for name, values in zip(self.outputs[1:], found[1:], strict=True):
+            z = where(np.array(self.output) == name, self._checked(values, self.m), z)
+        return z
 
     def _checked(self, z: Any, m: int | None) -> Any:
         if np.ndim(z) != 1 or m not in (None, len(z)):

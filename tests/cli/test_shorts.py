@@ -37,6 +37,10 @@ FILES = {
     "wrong.yaml": "next: {x: x + w}\nnoises: {w: 0.1}\nreadings: {z: x}\ndeviation: {z: 0.5}\n"
     "spread: {x: 2}\n",
     "ode.yaml": "rates: {x: -k*x}\nparameters: {k: 1}\n",
+    "many.py": "def law(t, k=1.0):\n    y = k * t\n    return k + t, y\n",
+    "named.py": "def law(t, k=1.0):\n    x, y = k + t, k * t\n    return y, x\n",
+    "pairs.csv": "t,x,y\n1,1.1,1.6\n2,1.2,1.3\n3,1.3,1.1\n",
+    "three.csv": "t,x,y,z\n1,1.1,1.6,1\n2,1.2,1.3,1\n3,1.3,1.1,1\n",
     "pair.yaml": "rates: {x: a*x, y: -b*y}\nstart: {a: 0.1, b: 0.2}\ninitial: {x: 1, y: 2}\n",
     "pair.csv": "time,x,y\n1,1.1,1.6\n2,1.2,1.3\n3,1.3,1.1\n",
     "weighed.csv": "time,x,y,sigma\n1,1.1,1.6,1\n2,1.2,1.3,1\n3,1.3,1.1,1\n",
@@ -132,7 +136,7 @@ def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: s
         *(
             (
                 ["pair.yaml", file, *more],
-                f"measurement=ode measurement.file=pair.yaml {noise} readings='{file}'".replace(
+                f"measurement=ode measurement.file=pair.yaml measurement.title=pair {noise} readings='{file}'".replace(
                     "  ", " "
                 ),
             )
@@ -142,6 +146,14 @@ def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: s
                 ("weighed.csv", [], ""),
                 ("alone.csv", [], ""),
             ]
+        ),
+        *(
+            (
+                [file, "pairs.csv"],
+                f"measurement=function measurement.of={file[:-3]}:law measurement.outputs={read}"
+                " noise=unknown noise.by=output readings='pairs.csv'",
+            )
+            for file, read in {"many.py": "['x','y']", "named.py": "['y','x']"}.items()
         ),
         (["measurement=ranging", "my.csv"], "measurement=ranging readings='my.csv'"),
         (
@@ -232,6 +244,8 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
         (["timed.py", "falling.csv"], "the argument t of f(t, a) has a default, which makes it"),
         (["gins", "line.csv"], "gins: is not KEY=VALUE; write measurement=gins"),
         (["t+y", "line.csv"], "no column is left for the readings"),
+        (["many.py", "three.csv"], "returns 2 arrays, and columns x, y, z are left for them; name"),
+        (["named.py", "three.csv"], "column z is not in law(t, k), which takes t, y, x; correct"),
         (["red.yaml", "log.csv"], "is no model: it has neither next:"),
         (["/usr/falling.py", "falling.csv"], "there is no such file"),
         (["a+b*t", "folder.csv"], "folder.csv: is a folder; name a file"),

@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from scipy.optimize import curve_fit
+from scipy.optimize import curve_fit, least_squares
 from shared.slopes import differentiate
 
 import ipe_bench as ib
@@ -98,6 +98,12 @@ def starred(t, *rest):
 def needs(t, k=1.0, *, g):
     return g * k * t
 
+def fix(east, north, x=3.0, y=4.0):
+    return np.sqrt((x - east)**2 + (y - north)**2), np.angle(x - east + 1j * (y - north))
+
+def pair(t, k=1.0):
+    return np.exp(-k * t), k * t
+
 def boom(t, k=1.0):
     return np.expp(-k * t)
 """
@@ -106,6 +112,9 @@ import jax.numpy as np
 
 def swing(t, length=1.2, damping=0.1, *, g=9.80665):
     return np.exp(-damping * t / 2) * np.cos(np.sqrt(g / length) * t)
+
+def pair(t, k=1.0):
+    return np.exp(-k * t), k * t
 """
 
 
@@ -437,3 +446,70 @@ def test_a_column_far_from_0_is_named_where_readings_do_not_change(laws):
     ours = ib.measurements.Function(of="some_laws:of_a_date", columns={"t": 2460000.5 + T})
     (said,) = ours.remarks(ours.nominal)
     assert "t is far from 0: subtract 2460000 from it" in said
+
+
+# A tuple of arrays
+
+
+def fixes(tmp_path):
+    """Ranges and bearings to a point from twelve places, one of which sees it across the cut."""
+    rng = np.random.default_rng(4)
+    places = rng.uniform(-5, 5, (12, 2))
+    places[0] = 7.0, 4.4
+    x, y = (np.array([2.5, 4.4]) - places).T
+    ranges = np.hypot(x, y) + rng.normal(0, 0.1, 12)
+    bearings = np.angle(np.exp(1j * (np.arctan2(y, x) + rng.normal(0, 0.02, 12))))
+    bearings[0] = -np.pi + 0.01
+    rows = np.column_stack([places, ranges, bearings])
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    path = tmp_path / "fixes.csv"
+    path.write_text("\n".join(["east,north,range,bearing", *lines]) + "\n")
+    return path, rows
+
+
+def test_ranges_and_bearings_of_one_function_are_fitted_as_by_scipy(laws):
+    path, rows = fixes(laws)
+    east, north, ranges, bearings = rows.T
+
+    def residuals(p):
+        x, y = p[0] - east, p[1] - north
+        turned = np.angle(np.exp(1j * (np.arctan2(y, x) - bearings)))
+        return np.concatenate([(np.hypot(x, y) - ranges) / 0.1, turned / 0.02])
+
+    found = least_squares(residuals, [3.0, 4.0], "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    law = ib.measurements.Function(
+        of="some_laws:fix", outputs=("range", "bearing"), circular=("bearing",)
+    )
+    noise = ib.noise.Gaussian(tuple([0.1, 0.02] * 12))
+    fit = ib.estimate(law, path, {"auto": ib.solvers.Auto()}, noise=noise, examine=False)[0]
+    expected = np.linalg.inv(found.jac.T @ found.jac)
+    errors = [fit.values[name] for name in "xy"] - found.x
+    assert np.abs(errors / np.sqrt(np.diag(expected))).max() < 1e-4
+    np.testing.assert_allclose(fit.covariance, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("of", ["some_laws:pair", "some_jax_laws:pair"])
+def test_readings_of_a_tuple_stand_row_by_row(laws, of):
+    if "jax" in of:
+        pytest.importorskip("jax")
+    law = ib.measurements.Function(of=of, columns={"t": [0.5, 2.0]}, outputs=("decay", "line"))
+    assert law.index["output"] == ("decay", "line", "decay", "line")
+    np.testing.assert_allclose(
+        law.simulate(np.array([[3.0]])), [[np.exp(-1.5), 1.5, np.exp(-6), 6]], rtol=1e-12
+    )
+    slopes = [[[-0.5 * np.exp(-1.5)], [0.5], [-2 * np.exp(-6)], [2.0]]]
+    np.testing.assert_allclose(law.jacobian(np.array([[3.0]])), slopes, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("of", "options", "said"),
+    [
+        ("pair", {"outputs": ("a", "b", "c")}, "outputs names 3 arrays; let it return a tuple"),
+        ("swing", {"outputs": ("a", "b")}, "outputs names 2 arrays; let it return a tuple"),
+        ("pair", {"outputs": ("a", "b"), "circular": ("c",)}, "circular=c: there is no such"),
+        ("pair", {}, "returns an array of shape"),
+    ],
+)
+def test_a_tuple_that_is_not_that_of_the_outputs_is_refused(laws, of, options, said):
+    with pytest.raises(ib.UserError, match=said):
+        model(of, **options).simulate(np.array([[1.0]]))
