@@ -136,13 +136,12 @@ def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: s
         *(
             (
                 ["pair.yaml", file, *more],
-                f"measurement=ode measurement.file=pair.yaml measurement.title=pair {noise} readings='{file}'".replace(
-                    "  ", " "
-                ),
+                "measurement=ode measurement.file=pair.yaml measurement.title=pair"
+                f"{noise} readings='{file}'",
             )
             for file, more, noise in [
-                ("pair.csv", [], "noise=unknown noise.by=output"),
-                ("pair.csv", ["noise.deviation=1"], "noise.deviation=1"),
+                ("pair.csv", [], " noise=unknown noise.by=output"),
+                ("pair.csv", ["noise.deviation=1"], " noise.deviation=1"),
                 ("weighed.csv", [], ""),
                 ("alone.csv", [], ""),
             ]
