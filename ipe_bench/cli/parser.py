@@ -279,6 +279,10 @@ class Parser(argparse.ArgumentParser):
             if after and "=" not in after[0] and not after[0].startswith("-"):
                 value = after[0]
             said = word.lstrip("-") if equals else f"{word[2:]}={value}"
+            from ipe_bench.plugins.discovery import groups
+
+            if word[2:] in groups() and not value.isidentifier():
+                said = f"{word[2:]}=NAME or {word[2:]}.KEY={value}"
             meant = did_you_mean(flag, flags) or f"; keys have no dashes: write {said}"
             raise UserError(f"{self.command}: {word}: there is no such flag{meant}")
         if word.startswith("-"):

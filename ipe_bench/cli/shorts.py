@@ -30,6 +30,7 @@ from ipe_bench.real.readings import SIGMA, quantity, read_tables
 from ipe_bench.report.words import enumerate_few
 
 _DATA = (".csv", ".tsv", ".txt", ".dat", ".parquet")
+_SHEETS = (".xlsx", ".xls", ".ods", ".numbers")
 _YAML = (".yaml", ".yml")
 _FUNCTION = re.compile(r"(?P<file>.+\.py)(:(?P<name>\w*))?")
 _FORMULA = re.compile(r"[-+*/^()<>]|\bif\b")
@@ -184,6 +185,10 @@ def _refuse_no_readings(words: Sequence[str]) -> None:
     """Refuses what stands in the place of a file of readings."""
     for word in words:
         if "=" not in word and not word.startswith(("-", "~")):
+            if Path(word).suffix.lower() in _SHEETS:
+                raise UserError(
+                    f"{word}: cannot be read; save the sheet as CSV, and give that file"
+                )
             near = did_you_mean(word, [one.name for one in Path().iterdir() if one.suffix in _DATA])
             raise UserError(f"{word}: is no file of readings ({', '.join(_DATA)}){near}")
 

@@ -42,6 +42,8 @@ _FILE = re.compile(
     rf"\+*(?:(measurement|state_model|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL
 )
 
+_OF_FUNCTIONS = ("start", "columns", "constants", "units", "circular", "reading")
+"""Keys of a user's own model, which stand behind measurement."""
 _PARAMETER = re.compile(r"\+*hydra\.sweeper\.params\.([^=]+)=(['\"]?)(.*)\2", re.DOTALL)
 
 Groups = dict[str, list[str]]
@@ -287,6 +289,8 @@ def _check(override: Override, groups: Groups) -> None:
         raise UserError(f"{word}: {unknown(group, groups, 'group')}")
     if first in plugins.PACKAGES:
         raise UserError(f"{word}: options are set by label; write {_by_label(first, word)}")
+    if first not in KEYS and first in _OF_FUNCTIONS:
+        raise UserError(f"{word}: there is no such key; did you mean measurement.{word}?")
     if first not in KEYS:
         raise UserError(f"{word}: {unknown(first, {*KEYS, *groups, 'experiment'}, 'key')}")
     if group == "estimators":

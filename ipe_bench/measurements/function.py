@@ -29,6 +29,11 @@ _CHUNK = 8
 on them."""
 _TIMES = ("t", "time")
 """Columns that are taken for the time of the readings."""
+_FOR_ARRAYS = {
+    "scalar": "np.exp in place of math.exp, and so on",
+    "truth value": "np.where(CONDITION, THEN, ELSE) in place of if",
+}
+"""What to write in a function of single numbers, by a word of the error that arrays meet there."""
 _LONGEST_TITLE = 40
 """Letters of a formula that is a title."""
 
@@ -145,8 +150,11 @@ class Function(WrittenModel):
                 raise UserError(
                     f"of={self.of}: there is no module {module} here; {module}.py would be one"
                 ) from None
+            remedy = ""
+            if isinstance(error, ModuleNotFoundError):
+                remedy = f"; install {error.name}, or correct the name"
             raise UserError(
-                f"of={self.of}: {module} cannot be imported: {place_of(error)}"
+                f"of={self.of}: {module} cannot be imported: {place_of(error)}{remedy}"
             ) from None
         if not callable(getattr(found, name, None)):
             functions = [key for key, value in vars(found).items() if inspect.isfunction(value)]
@@ -261,11 +269,11 @@ class Function(WrittenModel):
                 return self._at(values.real)
             file = getattr(sys.modules.get(self.function.__module__), "__file__", None)
             remedy = ""
-            if isinstance(error, TypeError) and "scalar" in str(error):
-                remedy = (
-                    f"; columns ({', '.join(self.headings)}) are arrays with a number per reading:"
-                    " write np.exp in place of math.exp, and so on"
-                )
+            if isinstance(error, TypeError | ValueError):
+                for said, instead in _FOR_ARRAYS.items():
+                    if said in str(error):
+                        arrays = f"columns ({', '.join(self.headings)}) are arrays"
+                        remedy = f"; {arrays} with a number per reading: write {instead}"
             raise UserError(f"measurement.of={self.of}: {place_of(error, file)}{remedy}") from error
         return self._read(found) if self.outputs else found
 
@@ -287,6 +295,8 @@ class Function(WrittenModel):
         if np.ndim(z) != 1 or m not in (None, len(z)):
             wanted = "one number per reading" + ("" if m is None else f", ({m},)")
             shape = "nothing" if z is None else f"an array of shape {np.shape(z)}"
+            if isinstance(z, int | float | complex | np.number):
+                shape = "one number for all readings"
             raise UserError(f"measurement.of={self.of}: returns {shape}; let it return {wanted}")
         return z
 

@@ -70,8 +70,8 @@ class Question:
         if given is None:
             if model.recorded is None:
                 raise UserError(
-                    "readings: is not given; write readings=FILE (see `ipe-bench list measurement"
-                    " -v`)"
+                    "readings: is not given; write readings=FILE, or as in"
+                    " `ipe-bench estimate oxygen.py oxygen.csv`"
                 )
             return Readings(informed(model, self.known), model.recorded.z)
         if given.shape != (model.m,):

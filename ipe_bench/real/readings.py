@@ -30,6 +30,7 @@ from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, inform
 
 SIGMA = "sigma"
 """The column of standard deviations of the readings."""
+_DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}\b")
 _IN_PARENTHESES = re.compile(r"\s*(?P<name>[^\[(]+?)\s+\((?P<unit>[^()]*)\)\s*")
 """A heading with its unit behind a blank."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -108,6 +109,10 @@ class TextTable:
         said = f"'{' '.join(text.split())}' is not a number"
         if self.decimal == ",":
             said += ", with decimal commas"
+        if _DATE.match(bare):
+            raise self.error(
+                f"{where}: {said}; write dates as numbers, such as days since the first"
+            )
         raise self.error(f"{where}: {said}; correct it, or leave the cell empty if it is missing")
 
     def column(self, name: str) -> list[tuple[str, str]]:

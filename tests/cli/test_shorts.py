@@ -367,3 +367,44 @@ def test_repeated_readings_and_scalar_functions_are_refused_with_what_to_write(
     short = shorts.read("estimate", ["scalar.py", "scalar.csv"])
     with pytest.raises(UserError, match=r"columns \(t\) are arrays .* np.exp in place of math.exp"):
         single("estimate", short.in_full).spec.question(()).checked()
+
+
+SAID = {
+    "return a": "returns one number for all readings; let it return one number per reading",
+    "return a if t > 2 else a * t": "write np.where(CONDITION, THEN, ELSE) in place of if",
+    "import absent_library": "No module named 'absent_library'; install absent_library, or correct",
+}
+
+
+@pytest.mark.parametrize("number", range(len(SAID)))
+def test_what_a_function_of_single_numbers_has_to_be_is_said(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body, said = [*SAID.items()][number]
+    monkeypatch.chdir(tmp_path)
+    top = body if body.startswith("import") else ""
+    (tmp_path / f"single_{number}.py").write_text(f"{top}\ndef f(t, a=1.0):\n    {body}\n")
+    (tmp_path / "own.csv").write_text("t,reading\n1,3.4\n2,5.2\n")
+    short = shorts.read("estimate", [f"single_{number}.py", "own.csv"])
+    with pytest.raises(UserError) as refused:
+        single("estimate", short.in_full).spec.question(()).checked()
+    assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["a*t", "book.xlsx"], "book.xlsx: cannot be read; save the sheet as CSV"),
+        (["a*t", "days.csv"], "write dates as numbers, such as days since the first"),
+        (["a*t", "line.csv", "start.a=2"], "did you mean measurement.start.a=2?"),
+        (["a*t", "line.csv", "--noise", "2"], "write noise=NAME or noise.KEY=2"),
+    ],
+)
+def test_a_mistake_is_told_with_what_to_write(
+    ipe_bench, words: list[str], said: str, tmp_path: Path
+) -> None:
+    (tmp_path / "days.csv").write_text("t,reading\n2024-01-01,1\n2024-01-02,2\n2024-01-05,3\n")
+    (tmp_path / "line.csv").write_text("t,reading\n1,1\n2,2\n3,4\n")
+    code, _, error = ipe_bench("estimate", *words)
+    assert code == 2
+    assert said in error
