@@ -16,7 +16,7 @@ README = (ROOT / "plugins/README.md").read_text(encoding="utf-8")
 ANSWERS = [
     line
     for line in README.partition("## Where things are")[2].splitlines()
-    if line.startswith("| Where")
+    if line.startswith("| ") and "`ipe_bench/" in line
 ]
 
 
@@ -51,7 +51,7 @@ BASES = {
 MADE = [
     (thing, kind)
     for answer in ANSWERS
-    for thing in re.findall(r"Where does a new ([\w ]+) go\?", answer)
+    for thing in re.findall(r"^\| a new ([\w ]+) \|", answer)
     for kind in re.findall(r"`ipe-bench new (\w+) NAME`", answer)
 ]
 
