@@ -26,7 +26,7 @@ from ipe_bench.cli import words as w
 from ipe_bench.cli.spec import KEYS
 from ipe_bench.measurements.arithmetic import parse
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.real.readings import SIGMA, quantity, read_tables
+from ipe_bench.real.readings import SIGMA, quantity, read_headings, read_tables
 from ipe_bench.report.words import enumerate_few
 
 _DATA = (".csv", ".tsv", ".txt", ".dat", ".parquet")
@@ -247,8 +247,7 @@ def _require_file(name: str) -> None:
 
 def _columns(file: str) -> list[str]:
     """Lists the columns of a file without their units."""
-    (table,) = read_tables([Path(file)])
-    return [quantity(heading) for heading in table.heading]
+    return [quantity(heading) for heading in read_headings(Path(file))]
 
 
 @dataclass

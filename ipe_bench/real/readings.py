@@ -16,6 +16,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ _IN_PARENTHESES = re.compile(r"\s*(?P<name>[^\[(]+?)\s+\((?P<unit>[^()]*)\)\s*")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NOT_FINITE = ("nan", "inf", "infinity")
 _MISSING = "a missing reading is an empty cell"
+_FIRST_ROWS = 100
 _SAMPLES = Path("ipe_bench/real/samples")
 """Folder of the package's own samples in a clone; from elsewhere, they are found in the package."""
 _WITH_COMMA = re.compile(r"[+-]?\d*,\d*([eE][+-]?\d+)?", re.ASCII)
@@ -120,6 +122,21 @@ class TextTable:
         at = self.heading.index(name)
         return [(row[at], f"row {number}, column {name}") for number, row in self.rows]
 
+    def numbers(self, name: str) -> list[float]:
+        """Parses the finite numbers of a column, NaN where a cell is empty.
+
+        Raises:
+            UserError: another cell is there.
+        """
+        at = self.heading.index(name)
+        cells = [row[at].strip() for _, row in self.rows]
+        # Of numbers alone nothing needs the name of a cell's place.
+        if self.decimal == "." and all(map(_NUMBER.fullmatch, cells)):
+            values = list(map(float, cells))
+            if all(map(math.isfinite, values)):
+                return values
+        return [self.value(*cell) for cell in self.column(name)]
+
     def find(self, wanted: str) -> str | None:
         """Finds the column of that heading; a heading without a unit is found with one, too."""
         if wanted in self.heading:
@@ -195,6 +212,8 @@ def read_tables(paths: Sequence[Path], without: Sequence[str] = ()) -> list[Text
 
 def _reduced(table: TextTable, without: Sequence[str]) -> TextTable:
     """Leaves columns out of a table."""
+    if not without:
+        return table
     gone = {table.find(name.strip()) for name in without}
     kept = [k for k, name in enumerate(table.heading) if name not in gone]
     heading = [table.heading[k] for k in kept]
@@ -202,9 +221,19 @@ def _reduced(table: TextTable, without: Sequence[str]) -> TextTable:
     return replace(table, heading=heading, rows=rows)
 
 
-def _read_table(path: Path) -> TextTable:
-    """Reads the table of a CSV or Parquet file, in which every row has as many cells as the
-    header."""
+def read_headings(path: Path) -> Sequence[str]:
+    """Reads the headings of a file; of its rows the first alone, among which a header that stands
+    too low is found.
+
+    Raises:
+        UserError: the file is absent or not a table.
+    """
+    return _read_table(path, _FIRST_ROWS).heading
+
+
+def _read_table(path: Path, most: int | None = None) -> TextTable:
+    """Reads the table of a CSV or Parquet file, or its first rows, at most so many, in which every
+    row has as many cells as the header."""
     if path.parent == _SAMPLES and not path.is_file():
         path = Path(__file__).with_name("samples") / path.name
     fault = fault_of(path)
@@ -212,7 +241,7 @@ def _read_table(path: Path) -> TextTable:
         raise TextTable(path).error(fault)
     data = path.read_bytes()
     table = TextTable(path, digest=hashlib.sha256(data).hexdigest())
-    table = (_with_parquet if path.suffix == ".parquet" else _with_text)(table, data)
+    table = (_with_parquet if path.suffix == ".parquet" else _with_text)(table, data, most)
     _require_header(table)
     for number, row in table.rows:
         if len(row) != len(table.heading):
@@ -244,7 +273,7 @@ def _wrong_length(table: TextTable, number: int, row: Sequence[str]) -> str:
     return f"has {len(row)} cells and the header {len(table.heading)}; {remedy}"
 
 
-def _with_parquet(table: TextTable, data: bytes) -> TextTable:
+def _with_parquet(table: TextTable, data: bytes, most: int | None) -> TextTable:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -256,13 +285,13 @@ def _with_parquet(table: TextTable, data: bytes) -> TextTable:
     heading = [name for name in found.column_names if not name.startswith("__index_level_")]
     columns = [
         ["" if cell is None else str(cell) for cell in column.to_pylist()]
-        for column in found.select(heading).columns
+        for column in found.select(heading).slice(0, most).columns
     ]
     rows = map(list, zip(*columns, strict=True))
     return replace(table, heading=heading, rows=list(enumerate(rows, 1)))
 
 
-def _with_text(table: TextTable, data: bytes) -> TextTable:
+def _with_text(table: TextTable, data: bytes, most: int | None) -> TextTable:
     try:
         text = data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
@@ -274,7 +303,8 @@ def _with_text(table: TextTable, data: bytes) -> TextTable:
     separator = next((sign for sign in ";\t" if sign in first), ",")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     try:
-        lines = [(reader.line_num, row) for row in reader if any(c.strip() for c in row)]
+        filled = ((reader.line_num, row) for row in reader if any(map(str.strip, row)))
+        lines = list(islice(filled, most))
     except csv.Error as error:
         raise table.error(
             f"row {reader.line_num}: cannot be read as CSV ({error}); fix the quotes"
@@ -403,7 +433,7 @@ def _readings_in(table: TextTable, model: Measurement) -> Readings:
         raise table.error("has a header and no rows")
     shown = _reading_column(table, model)
     used = (*filter(None, columns.values()), shown, *([sigma] if sigma else []))
-    z = np.array([table.value(*cell) for cell in table.column(shown)])
+    z = np.array(table.numbers(shown))
     known = {wanted.heading: _entries(table, wanted, column) for wanted, column in columns.items()}
     try:
         sampled = model.with_inputs(known, len(z))
@@ -471,6 +501,10 @@ def _entries(table: TextTable, wanted: Input, column: str | None) -> list[Any]:
     """Reads the values of an input, one for each row; its default if there is no such column."""
     if column is None:
         return [wanted.default] * len(table.rows)
+    if wanted.kind is float:
+        values = table.numbers(column)
+        if not any(map(math.isnan, values)):
+            return values
     return [_input(table, wanted, *cell) for cell in table.column(column)]
 
 

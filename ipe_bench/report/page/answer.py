@@ -833,9 +833,8 @@ _STORED = (
 
 def _fitted(one: Fit, labels: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     names = [p.name for p in one.model.physical_parameters]
-    normalised = as_json(one.normalised)
     outliers = [
-        {**labels[i], "normalised_residual": normalised[i]}
+        {**labels[i], "normalised_residual": as_json(one.normalised[i])}
         for i in np.flatnonzero(one.outliers).tolist()
     ]
     return {
