@@ -148,6 +148,8 @@ class Measurement(Component, ABC):
     input_columns_known: bool = True
     """Whether there are readings without a file, whose inputs stand in the config or are the
     model's own."""
+    linear: bool = False
+    """Whether readings are known to be a linear function of the physical parameters."""
     by_differential_equations: bool = False
     """Whether the readings are taken from a trajectory that can be entered anywhere:
     `OdeMeasurement`."""
@@ -423,6 +425,7 @@ class Forwarding(Measurement):
     usual_noise = _forwarded()
     own_parameters = _forwarded()
     by_differential_equations = _forwarded()
+    linear = _forwarded()
     input_columns_known = _forwarded()
     jacobian_cost = _forwarded()
     coarse_jacobian_cost = _forwarded()

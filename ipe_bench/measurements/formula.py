@@ -286,6 +286,11 @@ class Formula(WrittenModel):
         inputs = list(known.values())
         return Program.of([value], inputs), Program.of(by_parameter, inputs)
 
+    @cached_property
+    def linear(self) -> bool:
+        names = self.arithmetic.names
+        return self._recorded[0].linear([i for i, name in enumerate(names) if name in self.start])
+
     def _values(self, x: Array) -> list[Array]:
         """Returns the values of the names: of parameters (trials, 1), of columns (1, m)."""
         p = dict(zip(self.start, (x * self.sizes).T[:, :, None], strict=True))

@@ -61,6 +61,7 @@ class Levelled(WrappedModel):
     """f (m,): the part of each reading's degree of freedom that the levels are estimated from."""
 
     epochs = recorded = None
+    linear = False
 
     def __post_init__(self) -> None:
         """Skips the checks of options: the model was checked before."""

@@ -34,6 +34,8 @@ _STRETCHES = 27
 _STRAIGHT = 0.02
 """The share by which a rise differs at most from that of a linear model where steps may be
 large."""
+_EXACT = 1e-6
+"""The share by which a rise that a linear model tells differs at most from what is found."""
 _PRECISION = 1e-8
 """The precision of an end, as a share of its distance and of the half-width."""
 _JUMP = 0.01
@@ -225,6 +227,8 @@ class _Side:
         followed to it."""
         half = self.q * float(np.sqrt(self.P[self.place, self.place]))
         decade = float(decades(self.problem.measurement, self.x)[self.place])
+        if self._straight_to(half):
+            return half
         # A logarithm of which nothing is known may have any standard error.
         half = min(half, 8 * decade)
         near = 0.0
@@ -255,6 +259,14 @@ class _Side:
             if far > _FARTHEST * half:
                 break
         return np.inf
+
+    def _straight_to(self, half: float) -> bool:
+        """Tells whether the rise is known to be the distance in standard errors, as it is from the
+        minimum of a linear model without bounds."""
+        model = self.problem.measurement
+        if not model.linear or np.isfinite(natural_limits(model)).any():
+            return False
+        return np.isfinite(half) and abs(self.rise(half) / self.q - 1) < _EXACT
 
     def _crossing(self, near: float, far: float, half: float) -> float:
         """Finds the distance between `near` and `far` at which the rise is q, to a share of itself

@@ -305,6 +305,29 @@ def test_a_conditional_that_never_switches_is_named():
     assert said.startswith("measurement.expression: t > c holds at no reading")
 
 
+@pytest.mark.parametrize(
+    ("expression", "linear"),
+    [
+        ("a+b*t", True),
+        ("(a-b*exp(t))/t-a*sqrt(t)", True),
+        ("-(a if t > 1 else b*t)", True),
+        ("a*b*t", False),
+        ("a/(b+t)", False),
+        ("a*exp(b*t)", False),
+        ("a+abs(b)*t", False),
+        ("floor(a)+b*t", False),
+        ("a*t if a > t else b", False),
+    ],
+)
+def test_a_formula_is_linear_if_its_second_differences_are_zero_everywhere(expression, linear):
+    model = Formula(expression, {"a": 1.0, "b": 1.0}, {"t": (0.5, 1.5, 2.0, 7.0)})
+    assert model.linear is linear
+    x = np.random.default_rng(3).uniform(-5.0, 5.0, (30, 2))
+    middle = model.simulate((x[:15] + x[15:]) / 2)
+    ends = (model.simulate(x[:15]) + model.simulate(x[15:])) / 2
+    assert np.allclose(middle, ends) == linear
+
+
 def test_parameters_stand_as_they_are_written():
     model = Formula("exp(-k*t)*y0", {"y0": 2.0, "k": 1.0}, {"t": (0.0, 1.0)})
     assert [p.name for p in model.parameters] == ["y0", "k"]

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 from scipy.optimize import brentq, least_squares
-from scipy.stats import norm
+from scipy.stats import linregress, norm, t
 from shared.oracles import assert_agrees
 from shared.synthetic_store import Repeated
 
 from ipe_bench.baselines import GaussNewton, LevenbergMarquardt, MapLM
 from ipe_bench.measurements import Formula
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
-from ipe_bench.noise import Gaussian
+from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
 from ipe_bench.real.profiles import profiles, wald_interval
@@ -57,6 +57,24 @@ def test_the_interval_of_a_linear_parameter_has_its_ends_in_order_in_any_unit(si
     low, high = profiles(Scenario(model, Gaussian(0.4)).problem, z, x, 0.04 * np.eye(2))
     reach = 0.2 * Q * np.abs(sizes)
     np.testing.assert_allclose([low, high], [x * sizes - reach, x * sizes + reach], rtol=1e-4)
+
+
+@pytest.mark.oracle(
+    "library: SciPy's linregress", "half-widths of the intervals of a line, relative", 1e-6
+)
+def test_the_profiles_of_a_line_are_those_of_linear_regression(monkeypatch):
+    """Known at once of a model that is known to be linear, and searched for of any other."""
+    z = 2 + 5 * T + np.random.default_rng(5).normal(0.0, 0.3, 10)
+    known = linregress(T, z)
+    reach = t.isf(0.025, 8) * np.array([known.intercept_stderr, known.stderr])
+    problem = Scenario(LINE, Unknown()).problem
+    for linear in (True, False):
+        monkeypatch.setattr(Formula, "linear", linear)
+        found = examine(problem, z, fit(problem, z, LM, Unknown()))
+        assert found is not None
+        low, high = found.profiles
+        assert_agrees((high - low) / 2 / reach, np.ones(2), rtol=1e-6)
+        assert_agrees((high + low) / 2, [known.intercept, known.slope], rtol=1e-6)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
