@@ -275,6 +275,7 @@ class _Side:
         low = self.rise(near) - self.q
         high = self.rise(far) - self.q
         turns = 0
+        doublings = 0
         least = float(np.spacing(abs(self.x[self.place])))
         while True:
             # Of a standard error that is no size, the half-width is none either.
@@ -284,8 +285,11 @@ class _Side:
             share = high / (high - low) if high > low else 0.5
             met = far - share * (far - near)
             # Beside an end, a step beyond the crossing closes the interval.
-            at = float(np.clip(met, near + precision / 2, far - precision / 2))
+            beside = min(precision * 2.0 ** (doublings - 1), (far - near) / 2)
+            at = float(np.clip(met, near + beside, far - beside))
             here = self.rise(at) - self.q
+            # The rise may be q, but for round-off, over millions of such steps.
+            doublings = doublings + 1 if here == 0 else 0
             if here < 0:
                 near, low = at, here
                 high /= 2 if turns < 0 else 1
