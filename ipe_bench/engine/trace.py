@@ -301,18 +301,6 @@ def computed(operation: str, *values: Any) -> Any:
     return _ARRAYS[operation](*values)
 
 
-_LINEAR: dict[str, Callable[..., bool]] = {
-    "add": lambda a, b: True,
-    "sub": lambda a, b: True,
-    "neg": lambda a: True,
-    "mul": lambda a, b: not (a and b),
-    "div": lambda a, b: not b,
-    "where": lambda condition, a, b: not condition,
-    **dict.fromkeys(("fma", "fms", "fnma"), lambda a, b, c: not (a and b)),
-}
-"""Whether an operation on linear functions is one, from which of its operands move; others are
-not."""
-
 _PARTIALS: dict[str, Callable[[Any, Any, Any, Any], list[Any]]] = {
     "add": lambda e, one, a, b: [one, one],
     "sub": lambda e, one, a, b: [one, -one],
@@ -553,17 +541,6 @@ class Program:
                 operations.append((name, *(number[a.order] for a in taken)))
             number[e.order] = len(inputs) + len(operations) - 1
         return cls(len(inputs), tuple(operations), tuple(number[e.order] for e in outputs))
-
-    def linear(self, places: Collection[int]) -> bool:
-        """Tells whether the outputs are linear functions of the inputs of these places, for all
-        values of the others; a product of sums is not looked into."""
-        moves = {i: i in places for i in range(self.inputs)}
-        for at, (name, *numbers) in enumerate(self.operations, self.inputs):
-            moved = [name != "constant" and moves[i] for i in numbers]
-            if any(moved) and not _LINEAR.get(name, lambda *_: False)(*moved):
-                return False
-            moves[at] = any(moved)
-        return True
 
     @cached_property
     def _released(self) -> tuple[tuple[int, ...], ...]:

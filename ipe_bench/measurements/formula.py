@@ -288,8 +288,14 @@ class Formula(WrittenModel):
 
     @cached_property
     def linear(self) -> bool:
-        names = self.arithmetic.names
-        return self._recorded[0].linear([i for i, name in enumerate(names) if name in self.start])
+        program = self._recorded[0]
+        moves = [name in self.start for name in self.arithmetic.names]
+        for name, *numbers in program.operations:
+            moved = [name != "constant" and moves[i] for i in numbers]
+            if any(moved) and not _keeps_linear(name, *moved):
+                return False
+            moves.append(any(moved))
+        return True
 
     def _values(self, x: Array) -> list[Array]:
         """Returns the values of the names: of parameters (trials, 1), of columns (1, m)."""
@@ -337,3 +343,15 @@ class Formula(WrittenModel):
             slopes = self._own_differences.differences(x[lost])
             J[lost] = np.where(np.isnan(J[lost]), slopes, J[lost])
         return J
+
+
+def _keeps_linear(operation: str, *moved: bool) -> bool:
+    """Tells whether an operation on linear functions of parameters is one, from which of its
+    operands move with them."""
+    if operation in ("mul", "fma", "fms", "fnma"):
+        return not (moved[0] and moved[1])
+    if operation == "div":
+        return not moved[1]
+    if operation == "where":
+        return not moved[0]
+    return operation in ("add", "sub", "neg")

@@ -24,6 +24,7 @@ from ipe_bench.real.profiles import (
     Released,
     half_width,
     joint_region,
+    linear,
     natural_limits,
     profiles,
     wald_interval,
@@ -331,7 +332,10 @@ class Examination:
         return level * joint_region(n, confidence, self.freedom)
 
     def _starts(self) -> Array:
-        """Draws starts (starts, n) from the prior, behind the estimate."""
+        """Draws starts (starts, n) from the prior, behind the estimate; none if it is known that
+        there is one minimum."""
+        if linear(self.model):
+            return self.inner[None]
         problem = self.problem
         n = len(self.inner)
         spread = np.ones(n) if problem.prior_deviation is None else problem.prior_deviation

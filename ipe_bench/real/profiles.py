@@ -75,6 +75,13 @@ def natural_limits(model: Measurement) -> tuple[Array, Array]:
     return ends.min(axis=0), ends.max(axis=0)
 
 
+def linear(model: Measurement) -> bool:
+    """Tells whether the readings are known to be a linear function of parameters without bounds, so
+    that there is one minimum."""
+    bounded = np.isfinite(natural_limits(model)).any()
+    return model.linear and not bounded and not len(model.periods)
+
+
 def decades(model: Measurement, x: Array) -> Array:
     """Returns how far (n,) parameters at x (n,) move by a factor of 10 in their distance to a
     bound; infinite if they have none, or two."""
@@ -262,11 +269,10 @@ class _Side:
 
     def _straight_to(self, half: float) -> bool:
         """Tells whether the rise is known to be the distance in standard errors, as it is from the
-        minimum of a linear model without bounds."""
-        model = self.problem.measurement
-        if not model.linear or np.isfinite(natural_limits(model)).any():
+        minimum of a linear model."""
+        if not linear(self.problem.measurement) or not np.isfinite(half):
             return False
-        return np.isfinite(half) and abs(self.rise(half) / self.q - 1) < _EXACT
+        return abs(self.rise(half) / self.q - 1) < _EXACT
 
     def _crossing(self, near: float, far: float, half: float) -> float:
         """Finds the distance between `near` and `far` at which the rise is q, to a share of itself

@@ -19,10 +19,10 @@ from ipe_bench.real.examination import answers, examine
 from ipe_bench.real.fits import fit, scaled
 from ipe_bench.real.levels import maximise_likelihood, objective_of
 from ipe_bench.real.profiles import (
-    _Side,
     CONFIDENCE,
     _ahead,
     _along,
+    _Side,
     half_width,
     profiles,
     wald_interval,

@@ -446,7 +446,8 @@ def csv_text(data: pd.DataFrame) -> str:
             column = data.iloc[:, place]
             # Of many rows each different text is looked at once.
             shown = {cell: _no_formula(cell) for cell in column.unique()}
-            safe.isetitem(place, [shown.get(cell, cell) for cell in column])
+            if any(written is not cell for cell, written in shown.items()):
+                safe.isetitem(place, [shown.get(cell, cell) for cell in column])
     return _many_rows(safe) if len(safe) > _MANY_ROWS else safe.to_csv(index=False)
 
 
