@@ -293,12 +293,15 @@ class _Reader:
         """Lists the columns besides those that the model takes, sigma and those left out."""
         known = {*taken, SIGMA, *self._ignored}
         free = [name for name in self.columns if name not in known]
+        if len(free) < 2:
+            return free
         return [name for name in free if name not in self.texts] or free
 
     def _remarks(self, taken: Sequence[str], reading: str) -> list[str]:
         """Lists the columns of texts that stand beside the readings, and are left out."""
         known = {*taken, reading, SIGMA, *self._ignored}
-        return [name for name in self.texts if name not in known]
+        others = [name for name in self.columns if name not in known]
+        return [name for name in others if name in self.texts]
 
     @property
     def _ignored(self) -> list[str]:
