@@ -15,9 +15,16 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import generator
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.base import Measurement, Parameter
-from ipe_bench.measurements.known import ConstrainedModel
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.real.fits import FAR_BELOW, Fit, at_rows, falls_beyond, holding, scaled
+from ipe_bench.real.fits import (
+    FAR_BELOW,
+    Fit,
+    at_rows,
+    constrained,
+    falls_beyond,
+    holding,
+    scaled,
+)
 from ipe_bench.real.levels import Levelled, maximise_likelihood, maximum, objective_of
 from ipe_bench.real.profiles import (
     CONFIDENCE,
@@ -376,9 +383,7 @@ def examine(
         return None
     held_at = best.held_at
     if held_at:
-        if not isinstance(problem.measurement, ConstrainedModel):
-            problem = replace(problem, measurement=ConstrainedModel(problem.measurement, ()))
-        problem = holding(problem, held_at)
+        problem = holding(constrained(problem), held_at)
     rows = np.flatnonzero(np.isfinite(z))
     least = _least_levelled(best, z[rows]) if best.estimated is not None else _least(best, z[rows])
     if not least.converged or not (np.diag(least.P) > 0).all():

@@ -21,7 +21,7 @@ from ipe_bench.measurements.known import ConstrainedModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.real.examination import Examination, examine
-from ipe_bench.real.fits import Fit, compared, fit, holding
+from ipe_bench.real.fits import Fit, compared, constrained, fit, holding
 
 LABEL = "search"
 _AT_ONCE = 48
@@ -69,13 +69,19 @@ def examined(
         # What is held on a bound has no start inside.
         if found is None or found.least or found.on_bounds:
             break
-        names = [p.name for p in found.model.parameters]
-        point = dict(zip(names, found.minima[0].inner.tolist(), strict=True))
-        (further,) = fit(problem, z, {LABEL: From(point)}, noise)
+        further = _fit_from(problem, z, noise, found.model, found.minima[0].inner)
         before = [replace(one, beaten_by="", lower_at="") for one in fits if one.label != LABEL]
         fits = compared([*before, further])
         found = examine(problem, z, fits)
     return fits, found
+
+
+def _fit_from(problem: Problem, z: Array, noise: Noise, model: Measurement, x: Array) -> Fit:
+    """Fits from a point x (n,) in the coordinates of a model."""
+    names = [p.name for p in model.parameters]
+    point = dict(zip(names, x.tolist(), strict=True))
+    (found,) = fit(problem, z, {LABEL: From(point)}, noise)
+    return found
 
 
 def _with_steps(problem: Problem, z: Array, fits: list[Fit], noise: Noise) -> list[Fit]:
@@ -90,9 +96,7 @@ def _with_steps(problem: Problem, z: Array, fits: list[Fit], noise: Noise) -> li
     moved, between = _among_columns(best)
     if not between:
         return fits
-    names = [p.name for p in best.model.parameters]
-    point = dict(zip(names, moved.inner.tolist(), strict=True))
-    (further,) = fit(problem, z, {LABEL: From(point)}, noise)
+    further = _fit_from(problem, z, noise, best.model, moved.inner)
     steps = {place: between[place] for place in further.idle if place in between}
     if len(steps) < len(further.idle):
         return fits
@@ -100,10 +104,9 @@ def _with_steps(problem: Problem, z: Array, fits: list[Fit], noise: Noise) -> li
         if not all(_same_between(further, place, *ends) for place, ends in steps.items()):
             return fits
         # The readings step there, and no slope tells where.
-        if not isinstance(problem.measurement, ConstrainedModel):
-            problem = replace(problem, measurement=ConstrainedModel(problem.measurement, ()))
         middles = {place: (low + high) / 2 for place, (low, high) in steps.items()}
-        (held,) = fit(holding(problem, middles), z, {LABEL: From(point)}, noise)
+        rest = holding(constrained(problem), middles)
+        held = _fit_from(rest, z, noise, best.model, moved.inner)
         further = replace(held, model=further.model, held_at=middles, between=steps)
     before = [replace(one, beaten_by="", lower_at="") for one in fits]
     return compared([*before, further])

@@ -177,8 +177,12 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
     except FileNotFoundError:
         raise
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or type(error).__name__
-        raise Unusable(f"damaged: cannot be read ({reason})") from None
+        raise _unreadable(error) from None
+
+
+def _unreadable(error: Exception) -> Unusable:
+    reason = getattr(error, "strerror", None) or type(error).__name__
+    return Unusable(f"damaged: cannot be read ({reason})")
 
 
 def _require_footer(source: pa.NativeFile) -> None:
@@ -321,8 +325,7 @@ def read_record(path: Path, shape: Any) -> dict[str, Any]:
     try:
         record = json.loads(regular(path).read_bytes())
     except (OSError, ValueError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or type(error).__name__
-        raise Unusable(f"damaged: cannot be read ({reason})") from None
+        raise _unreadable(error) from None
     if not isinstance(record, dict):
         raise Unusable("damaged: is no record of ipe-bench")
     if record.get("schema") in range(1, SCHEMA):

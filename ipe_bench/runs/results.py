@@ -258,7 +258,7 @@ class Results:
     def problems(self) -> list[str]:
         """A line for everything that is missing, failed, refused or damaged."""
         lines = [f"{path}: {reason}; left out" for path, reason in self.damaged.items()]
-        refused = [run for run in self.runs if run.get("refused")]
+        refused = self._refused
         lines += [f"refused: {run.get('job', run['file'])}: {run['refused']}" for run in refused]
         lines += [line for cell in self.cells for line in cell.problems if not cell.refused]
         truths = {cell.scenario_id for cell in self.current if cell.label == TRUTH}
@@ -287,10 +287,14 @@ class Results:
         return lines
 
     @property
+    def _refused(self) -> list[Any]:
+        """The records of runs that were refused."""
+        return [run for run in self.runs if run.get("refused")]
+
+    @property
     def expected(self) -> int:
         """Cells that the records of runs announce, and refused jobs that came to none."""
-        refused = [run for run in self.runs if run.get("refused")]
-        return len(self._asked_for) + sum(not run["cells"] for run in refused)
+        return len(self._asked_for) + sum(not run["cells"] for run in self._refused)
 
     @property
     def complete(self) -> int:

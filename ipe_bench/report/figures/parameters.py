@@ -40,8 +40,7 @@ def draw(view: View) -> Iterator[Drawing]:
 def _of_one(view: View, estimator: str) -> Drawing:
     """Draws a panel per group of parameters in physical units, and one of all of them over their
     bounds."""
-    rows = view["summary"].query("estimator == @estimator and parameter != @ALL")
-    rows = rows.assign(solved_trials=(rows["solved"] * rows["trials"]).round())
+    rows = view.summary.query("estimator == @estimator and parameter != @ALL")
     totals = view.totals[view.totals["estimator"] == estimator].assign(parameter=ALL)
     groups = _groups(view.parameters)
     fig, axes = common.panels(len(groups) + 1, height=2.4)

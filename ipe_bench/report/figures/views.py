@@ -87,12 +87,16 @@ class View:
         return len(self.parameters)
 
     @cached_property
-    def totals(self) -> pd.DataFrame:
-        """The rows of the summary over all parameters, with the number of trials `solved_trials`
-        behind each."""
+    def summary(self) -> pd.DataFrame:
+        """The rows of the summary, with the number of trials `solved_trials` behind each."""
         rows = self["summary"]
-        rows = rows[rows["parameter"] == ALL].sort_values("error_scale", kind="stable")
         return rows.assign(solved_trials=(rows["solved"] * rows["trials"]).round())
+
+    @cached_property
+    def totals(self) -> pd.DataFrame:
+        """Those over all parameters, by error scale."""
+        rows = self.summary
+        return rows[rows["parameter"] == ALL].sort_values("error_scale", kind="stable")
 
     @cached_property
     def scales(self) -> list[float]:

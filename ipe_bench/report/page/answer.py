@@ -210,10 +210,14 @@ class Answer(Labelled[Fit]):
                 yield Strong(f"The readings are far from the readings of the start; try {start}.")
 
     @property
+    def best(self) -> Sequence[Fit]:
+        """The fits that pass; all of them if none does."""
+        return [one for one in self.fits if one.passes] or self.fits
+
+    @property
     def _lacking(self) -> list[Fit]:
-        """The fits at which the readings do not determine all: of those that pass, if any does."""
-        told = [one for one in self.fits if one.passes] or self.fits
-        return [one for one in told if one.undetermined]
+        """Those of the best at which the readings do not determine all."""
+        return [one for one in self.best if one.undetermined]
 
     def finding(self) -> str:
         """States the answer in one line: its first values, by whom, and how it was tested."""
@@ -568,8 +572,7 @@ def _values(values: Mapping[str, float], figures: int = 6) -> str:
 def _outliers(answer: Answer) -> Iterator[Table]:
     """Yields the most outlying readings, each with its largest residual and the estimators that
     find it so."""
-    fits = [f for f in answer.fits if f.passes] or answer.fits
-    told = [f for f in fits if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
+    told = [f for f in answer.best if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
     if not told:
         return
     beyond = np.flatnonzero(np.any([f.outliers for f in told], axis=0))
