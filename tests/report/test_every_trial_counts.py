@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -30,7 +31,7 @@ from ipe_bench.questions.compare.figure import draw_pairs
 from ipe_bench.questions.design.answer import _draw_design
 from ipe_bench.questions.posterior.answer import sampled
 from ipe_bench.questions.posterior.figure import draw_marginals
-from ipe_bench.report.figures import drawings
+from ipe_bench.report.figures import common, drawings, tracks
 from ipe_bench.report.figures.headline import MOST_CURVES, chosen
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.finding import Finding
@@ -486,6 +487,21 @@ def test_tracks_have_a_panel_each_with_how_many_are_kept_the_best_first():
     assert kept == sorted(kept, reverse=True)
     assert sorted(kept) == sorted((totals["success"] * totals["trials"]).round().astype(int))
     assert "over all trials" in drawing.caption
+
+
+def test_tracks_without_a_panel_are_named_as_the_worst():
+    several = (found for found in map(results, range(40)) if "path_error" in rows_of(found))
+    analysis = next(r.analysis for r in several if len({g.estimator for g in r.groups}) >= 4)
+    (view,), _ = views(analysis)
+    with house_style(), patch.object(common, "most_panels", return_value=3):
+        (drawing,) = tracks.draw(view)
+    here = view.totals[view.totals["error_scale"] == view["tracks"]["error_scale"].max()]
+    success = here.set_index("estimator")["success"]
+    told = drawing.caption.rpartition("Not shown, with larger errors: ")[2].rstrip(".")
+    absent = [label for label in success.index if label in told]
+    assert len(absent) == len(success) - 2
+    others = success.drop(absent)
+    assert others.min() >= success[absent].max()
 
 
 def rows_of(found: Any) -> dict[str, Any]:

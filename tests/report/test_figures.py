@@ -222,6 +222,41 @@ def test_points_of_few_trials_are_hollow_without_an_interval_and_missing_ones_br
     ]
 
 
+def test_the_background_tells_of_no_hollow_points():
+    """Estimators in grey have none, however few of their trials are solved."""
+    rows = pd.DataFrame({"estimator": "far", "error_scale": [1.0, 10.0], "trials": [60, 30]})
+    rows = rows.assign(error=[1.0, 2.0])
+    for color, entries in ((GREY, 0), ("#000000", 1)):
+        look = {"far": replace(looks(["far"])["far"], color=color)}
+        with house_style():
+            _, (ax,) = common.panels(1)
+            common.curves(ax, rows, "error", look, [1.0, 10.0])
+        told = [line.get_label() for line in ax.lines]
+        assert sum(str(words).startswith("hollow") for words in told) == entries
+
+
+@pytest.mark.parametrize("scales", [(1.0,), SCALES])
+def test_parameters_have_their_bounds_beside_them(synthetic, scales):
+    """A dotted curve over the scales, and a mark in each row of a single one."""
+    fill(synthetic, labels=("fixed_point",), scales=scales)
+    panel = drawn(parameters, only_view(synthetic))["parameter_errors_fixed_point"].figure.axes[0]
+    dotted = [line for line in panel.lines if line.get_linestyle() != "-"]
+    curves = [line for line in dotted if list(line.get_xdata()) == list(scales)]
+    assert bool(curves) == (len(scales) > 1)
+    bars = [one for one in panel.collections if isinstance(one, LineCollection)]
+    heights = [np.ptp(part[:, 1]) for one in bars for part in one.get_segments()]
+    marks = [height for height in heights if height == pytest.approx(0.6)]
+    assert bool(marks) == (len(scales) == 1)
+
+
+@pytest.mark.parametrize(("inches", "across"), [(3.4, 2), (7.0, 4)])
+def test_a_column_of_print_has_panels_that_are_read_side_by_side(inches, across):
+    with print_style(inches):
+        figure, axes = common.panels(4)
+    assert figure.get_figwidth() == inches
+    assert axes[0].get_subplotspec().get_gridspec().ncols == across
+
+
 def test_estimators_that_coincide_are_seen_side_by_side(synthetic):
     fill(synthetic, labels=("fixed_point", "two", "three"))
     panel = drawn(errors, only_view(synthetic))["headline"].figure.axes[1]
@@ -664,6 +699,10 @@ def test_published_errors_are_rings_about_those_that_are_found():
     at = {line.get_label(): list(line.get_xdata()) for line in ax.lines}
     assert at == {"published": [0.1, 0.2], "found": [0.125, 0.2]}
     assert "2.5e-02" in drawing.caption
+    # A page that chooses no figures has it.
+    with patch.object(certified, "published_table", return_value=rows), house_style():
+        (shown,) = (one for one in certified.FIGURES if one.draw is certified.draw_published)
+        assert shown.main
 
 
 # Settings -----------------------------------------------------------------------------------------

@@ -93,6 +93,15 @@ def test_of_many_the_best_of_each_family_is_drawn_and_the_others_are_named():
     assert list(draw(view(auto=(200,)))) == []
 
 
+def test_curves_are_percents_of_trials_and_no_scale_is_cut_off():
+    (ax,) = picture(view(**FALLING)).axes
+    drawn = [line for line in ax.lines if len(line.get_xdata()) == 3]
+    heights = {tuple(np.round(line.get_ydata(), 9)) for line in drawn}
+    assert heights == {(100.0, 100.0, 100.0), (100.0, 95.0, 0.0), (100.0, 97.5, 0.5)}
+    low, high = ax.get_xlim()
+    assert all(low <= x <= high for line in drawn for x in line.get_xdata())
+
+
 def test_the_title_is_the_finding_without_only():
     figure = picture(view(**FALLING))
     assert figure.texts[0].get_text() == "auto succeeds up to error scale 100"

@@ -225,4 +225,10 @@ def test_a_path_is_moved_to_the_turn_that_the_prior_prefers():
     begun = Descent.of(density, filtered(model, drawn.z, Taylor()))
     moved = in_first_turn(density, replace(begun, at=density.settled(away)))
     np.testing.assert_allclose(moved.at.x, x, atol=1e-9)
+    # Paths that are in this turn already cost nothing.
+    away[2:] = x[2:]
+    some = replace(begun, at=density.settled(away))
+    spent = in_first_turn(density, some).calls - some.calls
+    assert (spent[:2] > 0).all()
+    assert (spent[2:] == 0).all()
     assert (tracks.cost <= moved.at.cost).all()

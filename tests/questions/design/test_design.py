@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from unittest.mock import patch
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 from shared.oracles import agreed, assert_agrees
@@ -20,7 +21,13 @@ from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.extensions import richer_models
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.questions.design.answer import _findings, _further, design_parts
+from ipe_bench.questions.design.answer import (
+    READINGS,
+    _findings,
+    _further,
+    design_parts,
+    write_design,
+)
 from ipe_bench.questions.design.figure import draw_further
 from ipe_bench.questions.design.maths import design
 from ipe_bench.report.style import house_style
@@ -336,6 +343,21 @@ def test_fewer_readings_than_the_smallest_choice_has_are_refused():
     (way,) = ib.design(scenario(ib.measurements.Ranging()), by=["round"], readings=7).ways
     assert way.sharpest.readings == 7
     assert way.sharpest.mean_bound == pytest.approx(np.sqrt(3), rel=1e-6)
+
+
+def test_the_table_of_a_design_has_the_readings_of_each_choice(tmp_path):
+    found = ib.design(scenario(ib.measurements.Ranging()), by=["round"], readings=7)
+    write_design(tmp_path, "ranging", found)
+    rows = pd.read_csv(tmp_path / READINGS)
+    (way,) = found.ways
+    choices = {word: choice for word in ("saving", "sharpest") if (choice := getattr(way, word))}
+    assert set(rows["choice"]) == choices.keys()
+    index = pd.DataFrame(dict(found.candidates.index))
+    for word, choice in choices.items():
+        taken = rows[rows["choice"] == word].reset_index(drop=True)
+        wanted = index.iloc[list(choice.rows)].reset_index(drop=True)
+        pd.testing.assert_frame_equal(taken[[*index]], wanted, check_dtype=False)
+    assert set(rows["by"]) == {"round"}
 
 
 # What to read next --------------------------------------------------------------------------------
