@@ -94,12 +94,18 @@ def test_of_many_the_best_of_each_family_is_drawn_and_the_others_are_named():
 
 
 def test_curves_are_percents_of_trials_and_no_scale_is_cut_off():
-    (ax,) = picture(view(**FALLING)).axes
-    drawn = [line for line in ax.lines if len(line.get_xdata()) == 3]
-    heights = {tuple(np.round(line.get_ydata(), 9)) for line in drawn}
-    assert heights == {(100.0, 100.0, 100.0), (100.0, 95.0, 0.0), (100.0, 97.5, 0.5)}
+    """The last scale is no power of ten, and has no tick."""
+    of_all = view(**FALLING)
+    first = of_all.totals[of_all.totals["error_scale"] == 1.0]
+    more = [first.assign(error_scale=scale) for scale in (0.1, 300.0)]
+    of_all.totals = pd.concat([of_all.totals, *more])
+    of_all.scales = [0.1, 1.0, 10.0, 100.0, 300.0]
+    (ax,) = picture(of_all).axes
+    drawn = [line for line in ax.lines if len(line.get_xdata()) == 5]
     low, high = ax.get_xlim()
     assert all(low <= x <= high for line in drawn for x in line.get_xdata())
+    heights = {tuple(np.round(sorted(line.get_ydata())[:2], 9)) for line in drawn}
+    assert heights == {(100.0, 100.0), (0.0, 95.0), (0.5, 97.5)}
 
 
 def test_the_title_is_the_finding_without_only():
