@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import take
 from ipe_bench.basics.linalg import Array, Mask
@@ -91,20 +92,46 @@ def widened(density: PathDensity, at: Settled, tangents: Tangents) -> Around:
 
         w(t) = exp(-J / 2) (det H)^-1/2,   P = sum w (P(t) + (x(t) - x(0)) (x(t) - x(0))') / sum w.
     """
+    trials, _, n = at.x.shape
     out = Around.empty(at.x)
-    sides = 2 * density.model.n
-    slopes = int(_NUMBERS / (density.model.n**2 * density.model.epochs))
-    at_once = max(_LANES, slopes // sides)
-    for i in np.split(np.arange(len(at.x)), range(at_once, len(at.x), at_once)):
-        found = _of_some(density.subset(i), take(at, i), take(tangents, i))
-        out.P[i] = found.P
-        out.mass[i] = found.mass
-        out.log_determinant[i] = found.log_determinant
-        out.calls[i] = found.calls
+    axes = np.empty((trials, n, n))
+    unlike = np.empty((trials, n))
+    for i in _pieces(density, trials, 2 * n):
+        found = _looked_at(density.subset(i), take(at, i), take(tangents, i))
+        out.P[i], out.log_determinant[i], out.calls[i], axes[i], unlike[i] = found
+    rows = np.flatnonzero(unlike.max(axis=1) > _NORMAL)
+    for i in _pieces(density, len(rows), 2):
+        here = rows[i]
+        g = axes[here, unlike[here].argmax(axis=1)]
+        found = _followed(density.subset(here), take(at, here), take(tangents, here), g)
+        out.calls[here] += found.calls
+        wider = _is_wider(found.P[:, -1], axes[here])
+        out.P[here[wider]] = found.P[wider]
+        out.mass[here[wider]] = found.mass[wider]
     return out
 
 
-def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> Around:
+def _pieces(density: PathDensity, trials: int, paths: int) -> list[NDArray[np.intp]]:
+    """Returns the trials that are held at once, with so many paths of each."""
+    slopes = int(_NUMBERS / (density.model.n**2 * density.model.epochs))
+    at_once = max(_LANES, slopes // paths)
+    return np.split(np.arange(trials), range(at_once, trials, at_once))
+
+
+class _Looked(NamedTuple):
+    """Holds how the cost rises about paths."""
+
+    P: Array
+    """Covariances (trials, 1 + K, n, n) by the affine model."""
+    log_determinant: Array
+    calls: Array
+    axes: Array
+    """Inverse axes (trials, n, n) of the last states' covariance."""
+    unlike: Array
+    """Part of its rise (trials, n) along each by which the cost is not that of a normal density."""
+
+
+def _looked_at(density: PathDensity, at: Settled, tangents: Tangents) -> _Looked:
     trials, epochs, n = at.x.shape
     P, crossed, size = density.spread(tangents)
     lines, axes = _lines(P[:, -1], crossed)
@@ -112,22 +139,11 @@ def _of_some(density: PathDensity, at: Settled, tangents: Tangents) -> Around:
     owner = np.repeat(np.arange(trials), 2 * n)
     moved = density.subset(owner).settled(at.x[owner] + _FAR * sides)
     calls = moved.calls.reshape(trials, 2 * n).sum(axis=1)
-    out = Around(P, np.ones(trials), size, calls)
     # dJ / c^2 is 1 where the density is normal.
     rise = (moved.cost - at.cost[owner]).reshape(trials, 2, n) / _FAR**2
     unlike = np.abs(rise - 1.0).max(axis=1)
     known = (lines == 0).all(axis=(2, 3))
-    unlike = np.where(known, 0.0, unlike)
-    rows = np.flatnonzero(unlike.max(axis=1) > _NORMAL)
-    if rows.size:
-        g = axes[rows, unlike[rows].argmax(axis=1)]
-        some = density.subset(rows)
-        found = _followed(some, take(at, rows), take(tangents, rows), g)
-        out.calls[rows] += found.calls
-        wider = _is_wider(found.P[:, -1], axes[rows])
-        out.P[rows[wider]] = found.P[wider]
-        out.mass[rows[wider]] = found.mass[wider]
-    return out
+    return _Looked(P, size, calls, axes, np.where(known, 0.0, unlike))
 
 
 def _is_wider(moment: Array, axes: Array) -> Mask:
@@ -158,42 +174,45 @@ def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -
     x_K (trials, n) of the last states has unit variance."""
     trials = len(at.x)
     middle = Conditional.of(density, tangents, g)
-    moment = middle.P.copy()
-    total = np.ones(trials)
-    calls = np.zeros(trials)
     of_tangents = Taylor().calls(density.model.n) * density.model.evaluations
-    for sign in (1.0, -1.0):
-        rows = np.arange(trials)
-        x = at.x
-        line = middle.line
-        # Each side by itself: which of them comes first is the sign of an axis, which is round-off.
-        side = np.ones(trials)
-        for number in range(1, _POINTS + 1):
-            t = sign * _STRIDE * number
-            some = density.subset(rows)
-            begun = some.settled(x + sign * _STRIDE * line)
-            about = some.tangents(begun)
-            here = Conditional.of(some, about, g[rows])
-            # The rest of the path follows by a step of the affine model, g' x_K by none.
-            step = some.step(about, begun)
-            last = begun.x[:, -1] + step[:, -1] - at.x[rows, -1]
-            over = np.sum(g[rows] * last, axis=1) - t
-            there = some.settled(begun.x + step - over[:, None, None] * here.line)
-            calls[rows] += begun.calls + there.calls + of_tangents
-            d = density.model.nearest_state(there.x, at.x[rows]) - at.x[rows]
-            second = here.P + d[..., :, None] * d[..., None, :]
-            fall = at.cost[rows] - there.cost + middle.size[rows] - here.size
-            weight = np.exp(np.minimum(fall / 2, _MOST))
-            counted = np.isfinite(second).all(axis=(1, 2, 3)) & np.isfinite(weight)
-            weight = np.where(counted, weight, 0.0)
-            second = np.where(counted[:, None, None, None], second, 0.0)
-            side[rows] += weight
-            moment[rows] += weight[:, None, None, None] * second
-            going = weight * t**2 > _LITTLE * side[rows]
-            if not going.any():
-                break
-            rows = rows[going]
-            x = there.x[going]
-            line = here.line[going]
-        total += side - 1.0
-    return Around(moment / total[:, None, None, None], total / _OF_NORMAL, middle.size, calls)
+    # Each side by itself: which of them comes first is the sign of an axis, which is round-off.
+    owner = np.tile(np.arange(trials), 2)
+    sign = np.repeat([1.0, -1.0], trials)
+    moment = np.zeros((2 * trials, *middle.P.shape[1:]))
+    total = np.zeros(2 * trials)
+    calls = np.zeros(2 * trials)
+    rows = np.arange(2 * trials)
+    x = at.x[owner]
+    line = middle.line[owner]
+    for number in range(1, _POINTS + 1):
+        own = owner[rows]
+        t = sign[rows] * _STRIDE * number
+        some = density.subset(own)
+        begun = some.settled(x + sign[rows, None, None] * _STRIDE * line)
+        about = some.tangents(begun)
+        here = Conditional.of(some, about, g[own])
+        # The rest of the path follows by a step of the affine model, g' x_K by none.
+        step = some.step(about, begun)
+        last = begun.x[:, -1] + step[:, -1] - at.x[own, -1]
+        over = np.sum(g[own] * last, axis=1) - t
+        there = some.settled(begun.x + step - over[:, None, None] * here.line)
+        calls[rows] += begun.calls + there.calls + of_tangents
+        d = density.model.nearest_state(there.x, at.x[own]) - at.x[own]
+        second = here.P + d[..., :, None] * d[..., None, :]
+        fall = at.cost[own] - there.cost + middle.size[own] - here.size
+        weight = np.exp(np.minimum(fall / 2, _MOST))
+        counted = np.isfinite(second).all(axis=(1, 2, 3)) & np.isfinite(weight)
+        weight = np.where(counted, weight, 0.0)
+        second = np.where(counted[:, None, None, None], second, 0.0)
+        total[rows] += weight
+        moment[rows] += weight[:, None, None, None] * second
+        going = weight * t**2 > _LITTLE * (1.0 + total[rows])
+        if not going.any():
+            break
+        rows = rows[going]
+        x = there.x[going]
+        line = here.line[going]
+    moments = middle.P + moment[:trials] + moment[trials:]
+    mass = 1.0 + total[:trials] + total[trials:]
+    of_both = calls[:trials] + calls[trials:]
+    return Around(moments / mass[:, None, None, None], mass / _OF_NORMAL, middle.size, of_both)
