@@ -1,42 +1,34 @@
 """Examines a least-squares minimum beyond its standard errors: intervals that follow the bends of
-the model, which readings carry the answer, and whether another answer fits as well."""
+the model, which readings carry the answer, and whether another answer fits as well.
+
+What is examined is found in `examined`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, repeated
-from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import generator
-from ipe_bench.estimators.least_squares import inverse_factor
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.real.fits import (
-    FAR_BELOW,
-    Fit,
-    at_rows,
-    constrained,
-    falls_beyond,
-    holding,
-    scaled,
-)
-from ipe_bench.real.levels import Levelled, maximise_likelihood, maximum, objective_of
+from ipe_bench.real.fits import at_rows
+from ipe_bench.real.levels import Levelled, maximise_likelihood
+from ipe_bench.real.on_bounds import OnBound
 from ipe_bench.real.profiles import (
     CONFIDENCE,
     Released,
     half_width,
     joint_region,
     linear,
-    natural_limits,
     profiles,
     wald_interval,
 )
 from ipe_bench.real.residuals import tested
+from ipe_bench.real.within_bounds import answers
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 BOOTSTRAPS = 500
@@ -53,7 +45,7 @@ _FEWEST_DRAWS = 40
 """Draws below which there is no bootstrap: ends of 95 % intervals are the outermost one."""
 _SAME = 1e-2
 """Minima closer than this, in standard errors of either, are one."""
-_LOWER = 1e-6
+LOWER = 1e-6
 """Sums of squares that differ by less than this share, or number, are those of one minimum."""
 _SAME_READINGS = 1e-4
 """Answers whose readings differ by less than this, in standard deviations, are of one curve."""
@@ -88,17 +80,6 @@ class BootstrapIntervals:
     high: Array
     converged: int
     drawn: int
-
-
-@dataclass(frozen=True)
-class OnBound:
-    """Describes a parameter whose estimate is on a bound, because the readings want it beyond."""
-
-    parameter: Parameter
-    bound: float
-    other: float
-    """The other end of its profile interval; infinite if the readings set no limit, NaN if it was
-    not found."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,7 +299,7 @@ class Examination:
             x = minima.x[i]
             deviation = deviations(minima.covariance[i])
             # Starts end at one minimum again and again: it counts once.
-            if any((np.abs(x - y) <= _SAME * np.maximum(d, deviation)).all() for y, d in places):
+            if any(_alike(x, y, np.maximum(deviation, d)) for y, d in places):
                 continue
             places.append((x, deviation))
             chi_square = float(minima.chi_square[i])
@@ -363,7 +344,7 @@ class Examination:
         """Tells whether no minimum that was found is lower by more than chance explains."""
         least = self.minima[0].chi_square
         chance = self._region(least, 1 - FIT_LEVEL)
-        return self.chi_square <= least + chance + _LOWER * max(1.0, self.chi_square)
+        return self.chi_square <= least + chance + LOWER * max(1.0, self.chi_square)
 
     @property
     def ambiguous(self) -> list[Minimum]:
@@ -373,185 +354,6 @@ class Examination:
         return [one for one in as_good if (np.abs(one.x - self.x) > apart).any()]
 
 
-def examine(
-    problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS
-) -> Examination | None:
-    """Examines the least of the minima that estimators without a prior found, of several that found
-    it the first that passes; None if none of them found one."""
-    best = _best(fits)
-    if best is None or best.exact:
-        return None
-    held_at = best.held_at
-    if held_at:
-        problem = holding(constrained(problem), held_at)
-    rows = np.flatnonzero(np.isfinite(z))
-    least = _least_levelled(best, z[rows]) if best.estimated is not None else _least(best, z[rows])
-    if not least.converged or not (np.diag(least.P) > 0).all():
-        return None
-    found = Examination(
-        label=best.label,
-        whole=problem,
-        rows=rows,
-        problem=least.assumed,
-        z=z[rows],
-        inner=least.inner,
-        P=least.P,
-        chi_square=least.chi_square,
-        freedom=least.freedom,
-        bootstraps=bootstraps,
-        overstated=best.overstated >= FAR_BELOW,
-    )
-    # The place of a step has no profile.
-    if not held_at or best.between:
-        return found
-    outer = Problem(best.model, best.assumed.R)
-    return replace(
-        found,
-        released=_released(outer, found, held_at),
-        on_bounds=tuple(_on_bounds(outer, found, held_at)),
-    )
-
-
-def _best(fits: list[Fit]) -> Fit | None:
-    """Finds the fit at the least minimum; of several there the first of least squares that
-    passes."""
-    told = [
-        one
-        for one in fits
-        if one.status is Status.CONVERGED and np.isfinite(one.chi_square) and not one.with_prior
-    ]
-    best = min(told, key=lambda one: one.deviance, default=None)
-    if best is None:
-        return None
-    near = best.deviance + _LOWER * max(1.0, abs(best.deviance))
-    passing = (one for one in told if one.passes and one.deviance <= near and _least_squares(one))
-    return next(passing, best)
-
-
-class _Least(NamedTuple):
-    """Holds the minimum near a fit."""
-
-    assumed: Problem
-    inner: Array
-    P: Array
-    chi_square: float
-    freedom: int | Array | None
-    converged: bool
-
-
-def _least_levelled(best: Fit, z: Array) -> _Least:
-    """Finds the maximum of the restricted likelihood of readings z (m,) near a fit with several
-    levels."""
-    assert best.estimated is not None
-    found = maximum(best.estimated, z)
-    residual = z - found.model.near(found.fitted, z)
-    chi_square = float(np.sum(found.problem.R.whiten(residual) ** 2))
-    return _Least(found.problem, found.x, found.P, chi_square, found.freedom, found.converged)
-
-
-def _least(best: Fit, z: Array) -> _Least:
-    """Finds the least sum of squares of readings z (m,) near a fit."""
-    minima = maximise_likelihood(best.assumed, z[None], best.inner[None])
-    inner = minima.x[0]
-    P = minima.covariance[0]
-    chi_square = float(minima.chi_square[0])
-    converged = bool(minima.converged[0])
-    if best.level is None:
-        return _Least(best.assumed, inner, P, chi_square, None, converged)
-    # The minimum's own level, where the estimator's was a little higher.
-    freedom = best.degrees_of_freedom
-    factor = float(np.sqrt(chi_square / freedom))
-    assumed = scaled(best.assumed, factor)
-    return _Least(assumed, inner, P * factor**2, chi_square / factor**2, freedom, converged)
-
-
-def _least_squares(one: Fit) -> bool:
-    return one.estimator.equation == "least_squares"
-
-
-def _released(
-    problem: Problem, found: Examination, held_at: Mapping[int, float]
-) -> Released | None:
-    """Returns the problem in which parameters held on bounds may leave them; None if it has no
-    covariance there."""
-    model = problem.measurement
-    places = np.array(list(held_at))
-    bounds = np.array(list(held_at.values()))
-    given = replace(problem, measurement=model.stating("nominal", held_at))
-    x = np.array(given.measurement.nominal, dtype=float)
-    x[np.setdiff1d(np.arange(len(x)), places)] = found.inner
-    with np.errstate(all="ignore"):
-        J = objective_of(given, found.z[None]).jacobian(x[None])
-        inverse_U = inverse_factor(J)[0]
-    if not np.isfinite(inverse_U).all():
-        return None
-    start = model.physical(model.nominal[None])[0]
-    return Released(given, x, inverse_U @ inverse_U.T, places, np.sign(start[places] - bounds))
-
-
-def _on_bounds(
-    problem: Problem, found: Examination, held_at: Mapping[int, float]
-) -> Iterator[OnBound]:
-    """Computes the interval of each parameter on its bound, the others being held on theirs."""
-    lower, upper = natural_limits(problem.measurement)
-    for place, bound in held_at.items():
-        others = {k: value for k, value in held_at.items() if k != place}
-        k = place - sum(one < place for one in others)
-        part = _released(holding(problem, others) if others else problem, found, {k: bound})
-        end = np.nan
-        if part is not None:
-            end = float(np.clip(_end_inwards(part, found, k), lower[place], upper[place]))
-        yield OnBound(problem.measurement.physical_parameters[place], bound, end)
-
-
-def _end_inwards(part: Released, found: Examination, k: int) -> float:
-    """Finds the end of the profile of parameter k that lies inwards of its bound."""
-    freedom = found.freedom
-    if isinstance(freedom, np.ndarray):
-        freedom = np.insert(freedom, k, freedom.min())
-    sign = int(part.inwards[0])
-    ends = profiles(
-        part.problem, found.z, part.x, part.P, freedom=freedom, places=(k,), signs=(sign,)
-    )
-    return ends[int(sign > 0)][0]
-
-
-def answers(
-    problem: Problem, z: Array, x: Array, released: Released | None = None
-) -> tuple[Array, Mask]:
-    """Computes the least-squares estimates (sets, n) within the bounds, in the parameters' own
-    units, for readings z (sets, m) from x (sets, n), and the sets that have one; `released`
-    parameters keep their bounds."""
-    model = problem.measurement
-    minima = maximise_likelihood(problem, z, x)
-    values = model.physical(minima.x)
-    found = minima.converged.copy()
-    outside = np.zeros((len(x), 0), dtype=bool)
-    if released is not None:
-        outside = ~released.inside(minima.x)
-    # Sets that end on, or beyond, the same bounds are minimised again together, held there.
-    on_bounds: dict[tuple[tuple[int, float], ...], list[int]] = {}
-    for i in np.flatnonzero(~found | outside.any(axis=1)):
-        near = dict(model.near_bounds(minima.x[i]))
-        if released is not None:
-            near |= _left(model, released, outside[i])
-        found[i] = False
-        if 0 < len(near) < model.n:
-            on_bounds.setdefault(tuple(sorted(near.items())), []).append(int(i))
-    for key, sets in on_bounds.items():
-        near = dict(key)
-        free = [k for k in range(model.n) if k not in near]
-        held = holding(problem, near)
-        start = np.ascontiguousarray(minima.x[sets][:, free])
-        there = maximise_likelihood(held, z[sets], start)
-        found[sets] = there.converged & falls_beyond(problem, there.x, near, z[sets], released)
-        values[sets] = np.array([near.get(k, np.nan) for k in range(model.n)])
-        values[np.ix_(sets, free)] = held.measurement.physical(there.x)
-    return values, found
-
-
-def _left(model: Measurement, released: Released, outside: Mask) -> dict[int, float]:
-    """Returns the bounds, by place, that a minimum is outside of (bounds,)."""
-    places = released.places[outside]
-    bounds = model.physical(released.x[None])[0, places]
-    return dict(zip(places.tolist(), bounds.tolist(), strict=True))
+def _alike(x: Array, y: Array, deviation: Array) -> bool:
+    """Tells whether two minima (n,) are one."""
+    return bool((np.abs(x - y) <= _SAME * deviation).all())

@@ -20,7 +20,8 @@ from ipe_bench.measurements.base import Measurement, WrappedModel
 from ipe_bench.measurements.known import ConstrainedModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
-from ipe_bench.real.examination import Examination, examine
+from ipe_bench.real.examination import Examination
+from ipe_bench.real.examined import examine
 from ipe_bench.real.fits import Fit, compared, constrained, fit, holding
 
 LABEL = "search"

@@ -15,7 +15,7 @@ from ipe_bench.measurements import Formula, Polynomial, Sir
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Correlated, Gaussian, Unknown
-from ipe_bench.real.examination import answers, examine
+from ipe_bench.real.examined import examine
 from ipe_bench.real.fits import fit, scaled
 from ipe_bench.real.levels import maximise_likelihood, objective_of
 from ipe_bench.real.profiles import (
@@ -27,6 +27,7 @@ from ipe_bench.real.profiles import (
     profiles,
     wald_interval,
 )
+from ipe_bench.real.within_bounds import answers
 from ipe_bench.trials.scenario import Scenario
 
 LM = {"lm": LevenbergMarquardt(tolerance=1e-9, max_iterations=500)}

@@ -11,7 +11,7 @@ from ipe_bench.baselines import GaussNewton, LevenbergMarquardt, MapLM
 from ipe_bench.measurements import Formula
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.noise import Gaussian, Unknown
-from ipe_bench.real.examination import examine
+from ipe_bench.real.examined import examine
 from ipe_bench.real.fits import fit
 from ipe_bench.real.profiles import profiles, wald_interval
 from ipe_bench.trials.scenario import Scenario

@@ -19,7 +19,7 @@ from ipe_bench.measurements import Formula, Nist
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Unknown
-from ipe_bench.real.examination import examine
+from ipe_bench.real.examined import examine
 from ipe_bench.real.fits import fit
 from ipe_bench.real.levels import Levelled, maximise_likelihood
 from ipe_bench.real.profiles import CONFIDENCE, half_width
