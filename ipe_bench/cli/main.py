@@ -39,9 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(
-            stream, io.TextIOWrapper
-        ):  # one that knows no Greek letters shows question marks
+        # One that knows no Greek letters shows question marks.
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     # Batched linear algebra is small per trial: more BLAS threads only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -50,10 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     # use.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     COMMAND.set(shlex.join(["ipe-bench", *words]))
-    with (
-        contextlib.redirect_stdout(_door(sys.stdout)),
-        contextlib.redirect_stderr(_door(sys.stderr)),
-    ):
+    out = contextlib.redirect_stdout(_door(sys.stdout))
+    err = contextlib.redirect_stderr(_door(sys.stderr))
+    with out, err:
         return _answer(words)
 
 
@@ -132,10 +130,14 @@ def _dispatch(words: list[str]) -> int:
         if command.startswith("-"):
             remedy = unknown(command, ("--help", "--version"), "flag")
         raise UserError(f"{command}: {remedy}")
-    parser = parser_of(command)
     if any(word in ("-h", "--help") for word in rest):
-        parser.print_help()
+        parser_of(command).print_help()
         return 0
+    return _begin(command, rest)
+
+
+def _begin(command: str, rest: Sequence[str]) -> int:
+    """Begins a command with the words behind it, short forms written out."""
     files: Sequence[str] = ()
     if command in SHORT and not all("=" in word for word in rest):
         from ipe_bench.cli import shorts
@@ -150,6 +152,7 @@ def _dispatch(words: list[str]) -> int:
         if command in QUESTIONS:
             rest = short.words
             files = short.readings
+    parser = parser_of(command)
     if command in QUESTIONS:
         return question_command(command, parser.parse(rest).arguments, files)
     module = importlib.import_module(f"ipe_bench.cli.{HOMES[command]}")

@@ -93,19 +93,12 @@ def run_command(arguments: Sequence[str]) -> int:
             return 0
         typed = [*_rerun(flags.experimental_rerun), *flags.overrides]
         swept = [w.swept(word) for word in typed]
-        words = w.read("run", swept, folder)
-        named = w.read("run", [f"default_name='{w.default_name(words)}'"])
-        words = replace(words, overrides=words.overrides + named.overrides)
+        words = _named(w.read("run", swept, folder))
         jobs = jobs_of(words, multirun=flags.multirun or swept != typed)
         if flags.cfg or flags.info or flags.hydra_help:
             show(words, flags)
             return 0
-        words.refuse(OF_FILES, "is for `ipe-bench estimate`: run simulates its readings")
-        require_one_kind(words, jobs.specs[0])
-        if words.standard_baselines:
-            jobs = replace(jobs, specs=[one.suited() for one in jobs.specs])
-        for one in jobs.specs:
-            _ = one.scenario  # whose parts may not suit one another
+        jobs = _suited(words, jobs)
         if flags.dry_run:
             say(*_missing(jobs))
             return 0
@@ -114,12 +107,34 @@ def run_command(arguments: Sequence[str]) -> int:
             say(*_left_out(jobs.specs))
         command = shlex.join(["ipe-bench", "run", *arguments])
         task = Task(command, words.files, words.standard_baselines)
-        if jobs.told:
-            stored = _Stored()
-            for told, spec in zip(jobs.told, jobs.specs, strict=True):
-                task.compute(told, spec, stored.of(spec))
-        outcomes = task.outcomes if jobs.told else _launched(jobs, task)
+        outcomes = _computed_here(jobs, task) if jobs.told else _launched(jobs, task)
     return _conclude(jobs, outcomes)
+
+
+def _named(words: w.Words) -> w.Words:
+    """Adds the name that results have if none is given."""
+    named = w.read("run", [f"default_name='{w.default_name(words)}'"])
+    return replace(words, overrides=words.overrides + named.overrides)
+
+
+def _suited(words: w.Words, jobs: Jobs) -> Jobs:
+    """Refuses jobs whose words or parts do not go together, and leaves out standard baselines that
+    do not suit a job."""
+    words.refuse(OF_FILES, "is for `ipe-bench estimate`: run simulates its readings")
+    require_one_kind(words, jobs.specs[0])
+    if words.standard_baselines:
+        jobs = replace(jobs, specs=[one.suited() for one in jobs.specs])
+    for one in jobs.specs:
+        _ = one.scenario  # whose parts may not suit one another
+    return jobs
+
+
+def _computed_here(jobs: Jobs, task: Task) -> list[Outcome]:
+    """Returns the outcomes of jobs whose words are known, computed one after another."""
+    stored = _Stored()
+    for told, spec in zip(jobs.told, jobs.specs, strict=True):
+        task.compute(told, spec, stored.of(spec))
+    return task.outcomes
 
 
 def _launched(jobs: Jobs, task: Task) -> list[Outcome]:
@@ -299,31 +314,23 @@ def _computed(job: Spec, begun: Outcome, command: str, known: Results | None) ->
     if job.write_readings is not None:
         write_trial(job, Path(job.write_readings), job.write_readings_trial)
         return begun
-    asked: Any = ([job.scenario], job.estimators, job.count, job.output)
-    options: dict[str, Any] = {
-        "execution": job.execution,
-        "block_size": job.block_size,
-        "command": command,
-    }
     if job.state_model is None:
         remarks = job.measurement.remarks(job.measurement.nominal)
     else:
         remarks = job.state_model.remarks()
     done = replace(begun, remarks=remarks)
+    asked: Any = ([job.scenario], job.estimators, job.count, job.output)
     with watching(begun.label(command), lines=True) as watch:
+        options: dict[str, Any] = {
+            "execution": job.execution,
+            "block_size": job.block_size,
+            "command": command,
+            "watch": watch,
+        }
         if job.precision is None:
-            done = replace(done, failures=compute(*asked, **options, watch=watch, known=known))
+            done = replace(done, failures=compute(*asked, **options, known=known))
         else:
-            from ipe_bench.statistics.stopping import NARROW, compute_until
-
-            options |= {"precision": job.precision, "time_limit": job.time_limit}
-            failures, (stop,) = compute_until(*asked, **options, watch=watch)
-            missed = stop["reason"] != NARROW
-            verdict = "the precision is not reached: " if missed else ""
-            said = (
-                f"{done.job}: {stop['trials']} trials; {verdict}{stop['reason']} ({stop['widest']})"
-            )
-            done = replace(done, failures=failures, stop=said, precision_missed=missed)
+            done = _until_precise(job, done, asked, options)
     if job.objective is not None:
         from ipe_bench.statistics.stopping import objective
 
@@ -333,33 +340,59 @@ def _computed(job: Spec, begun: Outcome, command: str, known: Results | None) ->
     return replace(done, cells={one.key: describe_names(one.names) for one in keys})
 
 
+def _until_precise(job: Spec, begun: Outcome, asked: Any, options: Mapping[str, Any]) -> Outcome:
+    """Computes as many trials as the precision of a job needs, and says where it ended."""
+    from ipe_bench.statistics.stopping import NARROW, compute_until
+
+    failures, (stop,) = compute_until(
+        *asked, **options, precision=job.precision, time_limit=job.time_limit
+    )
+    missed = stop["reason"] != NARROW
+    verdict = "the precision is not reached: " if missed else ""
+    said = f"{begun.job}: {stop['trials']} trials; {verdict}{stop['reason']} ({stop['widest']})"
+    return replace(begun, failures=failures, stop=said, precision_missed=missed)
+
+
 def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
     """Shows the outcomes of the jobs; returns the exit code."""
     end_idle()  # a report on many trials has use for their memory
-    first = jobs.specs[0]
-    refused = [one for one in outcomes if one.mistake]
-    if jobs.multirun and first.write_readings is None:
-        known = jobs.specs if len(jobs.specs) == len(outcomes) else [None] * len(outcomes)
-        for one, spec in zip(outcomes, known, strict=True):
-            if one.mistake:
-                parts: Any = () if spec is None else (spec.scenario, spec.estimators, spec.count)
-                record_refusal(one.output, one.job, one.mistake, *parts)
     failed = any(one.failures or one.precision_missed for one in outcomes)
     code = 1 if failed else 0
-    folders: dict[str, dict[str, str]] = {}
-    # Of jobs that a sweeper ran in other processes nothing is known but the folder.
-    for one in outcomes or [Outcome(job.output) for job in jobs.specs]:
-        folders.setdefault(one.output, {}).update(one.cells)
-    for output, cells in folders.items():
-        if (Path(output) / "trials").is_dir() and first.write_readings is None:
-            folder = Path(output)
-            shown = show_report([folder], folder, first.figures, first.formats, cells)
-            code = max(code, shown)
+    if jobs.specs[0].write_readings is None:
+        if jobs.multirun:
+            _record_refusals(jobs, outcomes)
+        code = max(code, _show_reports(jobs, outcomes))
+    refused = [one for one in outcomes if one.mistake]
     remarks = [remark for one in outcomes for remark in one.remarks]
     say(*dict.fromkeys(f"Note: {remark}" for remark in remarks))
     say(*_best(outcomes, jobs.maximises), *(one.stop for one in outcomes if one.stop))
     if refused:
         raise UserError(_refused(refused, told=jobs.multirun and len(outcomes) > 1))
+    return code
+
+
+def _record_refusals(jobs: Jobs, outcomes: Sequence[Outcome]) -> None:
+    """Records which jobs were refused, so that reports say what is missing."""
+    known = jobs.specs if len(jobs.specs) == len(outcomes) else [None] * len(outcomes)
+    for one, spec in zip(outcomes, known, strict=True):
+        if one.mistake:
+            parts: Any = () if spec is None else (spec.scenario, spec.estimators, spec.count)
+            record_refusal(one.output, one.job, one.mistake, *parts)
+
+
+def _show_reports(jobs: Jobs, outcomes: Sequence[Outcome]) -> int:
+    """Shows the report of each folder that has results; returns the largest exit code."""
+    first = jobs.specs[0]
+    cells: dict[str, dict[str, str]] = {}
+    # Of jobs that a sweeper ran in other processes nothing is known but the folder.
+    for one in outcomes or [Outcome(job.output) for job in jobs.specs]:
+        cells.setdefault(one.output, {}).update(one.cells)
+    code = 0
+    for output, of_folder in cells.items():
+        folder = Path(output)
+        if (folder / "trials").is_dir():
+            shown = show_report([folder], folder, first.figures, first.formats, of_folder)
+            code = max(code, shown)
     return code
 
 
