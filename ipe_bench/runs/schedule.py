@@ -120,10 +120,8 @@ def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
         block = block_of(cells[0].scenario, task.start, task.stop)
         block.share()  # which is not to be charged to the first of the cells
     for index, cell in enumerate(cells):
-        with (
-            contextlib.suppress(Exception, SystemExit),
-            _alone(),
-        ):  # what it raises now, it raises again below
+        # What it raises now, it raises again below.
+        with contextlib.suppress(Exception, SystemExit), _alone():
             _warm_up(block, cell)
         yield PREPARED
         failure = None
@@ -149,12 +147,15 @@ def _recalled(task: Task) -> tuple[ResultKey, ...]:
         _recent.clear()
     for cell in task.cells:
         known = _recent.get(cell.key)
-        if known is None or component_classes(known.components) != component_classes(
-            cell.components
-        ):
+        if known is None or not _has_same_classes(known, cell):
             _require_same_source(cell)
             _recent[cell.key] = cell
     return tuple(_recent[cell.key] for cell in task.cells)
+
+
+def _has_same_classes(known: ResultKey, cell: ResultKey) -> bool:
+    """Tells whether cells of one key are of the same classes: a notebook may define one anew."""
+    return component_classes(known.components) == component_classes(cell.components)
 
 
 def _require_same_source(cell: ResultKey) -> None:

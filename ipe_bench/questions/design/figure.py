@@ -28,20 +28,16 @@ def draw_further(model: Measurement, further: Further) -> Drawing:
     shares = further.bounds / today
     shown = np.argsort(shares[-1], kind="stable")[:MOST_PARAMETERS]
     fig, axes = common.panels(2 if further.column else 1, height=3.0)
+    by_number, *by_place = axes
     for i, k in enumerate(shown):
         p = model.parameters[k]
         line: Any = {"color": COLORS[i], "label": common.text(p.name), "zorder": 3 - 0.1 * i}
-        axes[0].plot(range(len(shares)), shares[:, k], "o-", **line)
-        for ax in axes[1:]:
+        by_number.plot(range(len(shares)), shares[:, k], "o-", **line)
+        for ax in by_place:
             ax.plot(further.entries, further.alone[:, k] / today[k], **line)
-    axes[0].set_xlabel("further readings, where they help most")
-    for ax in axes[1:]:
-        ax.set_xlabel(common.text(further.column))
-        at = further.entries[further.taken[0]]
-        ax.axvline(at, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label="next")
-        given = np.asarray(labels(model)[further.column], dtype=float)
-        style: Any = {"linestyle": "none", "color": BOUND_COLOR, "clip_on": False}
-        ax.plot(given, np.ones(len(given)), marker="|", label="today's readings", **style)
+    by_number.set_xlabel("further readings, where they help most")
+    for ax in by_place:
+        _mark_places(ax, model, further)
     for ax in axes:
         common.decades(ax, shares[:, shown], least=1.25)
         ax.set_ylabel("bound over today's")
@@ -54,6 +50,16 @@ def draw_further(model: Measurement, further: Further) -> Drawing:
         parameters = "1 parameter that gains" if left == 1 else f"{left} parameters that gain"
         caption += f" Not drawn: {parameters} less."
     return Drawing("further", f"Read next at {further.words[further.taken[0]]}", caption, fig)
+
+
+def _mark_places(ax: Any, model: Measurement, further: Further) -> None:
+    """Marks where readings are taken today, and where the next one helps most."""
+    ax.set_xlabel(common.text(further.column))
+    best = further.entries[further.taken[0]]
+    ax.axvline(best, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label="next")
+    given = np.asarray(labels(model)[further.column], dtype=float)
+    style: Any = {"linestyle": "none", "color": BOUND_COLOR, "clip_on": False}
+    ax.plot(given, np.ones(len(given)), marker="|", label="today's readings", **style)
 
 
 def draw_bounds(
