@@ -27,10 +27,10 @@ NAMES = {
         *("_ITERATIONS", "_TRIED", "_PER_DECADE", "_NEAR_ROOT", "_CHORDS"),
         *("_JACOBIANS", "_BENT", "_CONTRACTING", "_DEPTH"),
     ),
-    "starts": ("LONG", "_PROMISING", "_SHORT", "_APART", "_LOOKS"),
+    "starts": ("LONG", "_PROMISING", "_SHORT", "_APART", "_LOOKS", "_HALVINGS"),
     "windows": (
         *("_DAMPING", "_FIRST_ITERATIONS", "_SLOW_GROWTH", "_FIRST_DRAWS", "_RANDOMISED"),
-        *("_AS_BAD",),
+        *("_AS_BAD", "_CAREFUL_ITERATIONS", "_THINNING", "_GIVEN_UP", "_ONE"),
     ),
     "progressive": ("_SAME_FIT", "_BULK", "_READINGS", "_TRUSTED", "_WORTH"),
     "auto": ("_CONFIRMATIONS", "_WORTH", "_LED", "_DAMPING", "_STEPS"),
@@ -60,6 +60,15 @@ def outcome(drawn: list[tuple[Scenario, Any]], module: str) -> tuple[int, float]
     return solved, float(np.mean(logarithms))
 
 
+def multiplied(value: Any, factor: float) -> Any:
+    """Multiplies a constant, or every number of a tuple; a whole number stays one, 1 at least."""
+    if isinstance(value, tuple):
+        return tuple(multiplied(one, factor) for one in value)
+    if isinstance(value, int):
+        return max(int(value * factor), 1)
+    return value * factor
+
+
 def main(modules: list[str], names: list[str]) -> None:
     drawn = [(scenario, scenario.draw(0, TRIALS)) for scenario in cells()]
     print("| constant | value | solved, less | more | cost, less | more |")
@@ -73,12 +82,12 @@ def main(modules: list[str], names: list[str]) -> None:
                 value = getattr(place, name)
                 found = []
                 for factor in (1 / FACTOR, FACTOR):
-                    setattr(place, name, type(value)(max(value * factor, 1e-300)))
+                    setattr(place, name, multiplied(value, factor))
                     found.append(outcome(drawn, module))
                     setattr(place, name, value)
                 solved = [f"{one[0] - today[0]:+d}" for one in found]
                 cost = [f"{np.expm1(one[1] - today[1]):+.0%}" for one in found]
-                print(f"| {name} | {value:g} | {' | '.join([*solved, *cost])} |", flush=True)
+                print(f"| {name} | {value} | {' | '.join([*solved, *cost])} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -386,12 +386,12 @@ def test_a_mistake_is_one_line_with_exit_code_2(tmp_path, ipe_bench, case):
         ["estimators.fixed_point.budget=null"],
     ],
 )
-def test_what_is_right_is_taken(words, ipe_bench):
+def test_a_right_command_line_is_taken(words, ipe_bench):
     code, _, err = ipe_bench("run", *words, "--cfg", "job")
     assert (code, err) == (0, "")
 
 
-def test_nothing_is_overwritten(readings, ipe_bench):
+def test_no_file_is_overwritten(readings, ipe_bench):
     before = readings.read_text()
     code, _, error = ipe_bench("run", f"write_readings={readings}")
     assert code == 2

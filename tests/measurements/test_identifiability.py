@@ -184,7 +184,7 @@ def model(rates, initial, outputs, constants):
     0,
 )
 @pytest.mark.parametrize("name", slow_if(lambda name: [*CASES].index(name) % 3 > 0, CASES))
-def test_published_answers(name):
+def test_lost_parameters_are_those_that_others_have_published(name):
     *described, expected = CASES[name]
     found = structure(model(*described))
     assert found is not None
@@ -193,14 +193,14 @@ def test_published_answers(name):
     assert len(found.sentences) == len(found.groups)
 
 
-def test_what_is_fixed_is_known():
+def test_a_parameter_that_is_fixed_tells_another_that_was_lost_with_it():
     *described, _ = CASES["prey"]
     assert lost(ConstrainedModel(model(*described), (ParameterInfo("v0", fixed=0.9),))) == ()
 
 
 @pytest.mark.parametrize("output", ["z", "z/(0.3+z)"])
 @pytest.mark.parametrize("inflow", [60.0, 232.0, 1000.0, 5000.0])
-def test_a_cold_saturable_cascade_is_told(inflow, output):
+def test_the_loss_of_a_stage_that_saturates_from_rest_is_told(inflow, output):
     """The second stage's loss is the only unknown, and its readings change with it."""
     rates = {"y": "2-L*y/(Km+y)", "z": "L*y/(Km+y)-k1*z"}
     for half, interval in itertools.product((0.01, 0.05, 0.3), (0.5, 1.0, 4.0)):
@@ -212,7 +212,7 @@ def test_a_cold_saturable_cascade_is_told(inflow, output):
         )
 
 
-def test_nothing_is_said_against_the_readings():
+def test_a_parameter_that_acts_later_than_orders_are_computed_is_not_called_lost():
     """k acts from order 17 of the output on, later than orders are computed; readings at late times
     change with it."""
     late = Ode({"y": "k*t**8*t**8-y"}, {"k": 1.0}, {"y": 1.0}, times=(0.5, 1.0, 2.0))
@@ -228,7 +228,7 @@ def test_a_model_that_would_take_long_has_no_answer(monkeypatch):
     assert structure(prey) is None
 
 
-def test_what_an_exponential_is_at_its_start():
+def test_a_rate_of_a_state_that_rests_is_lost_and_told_from_elsewhere():
     """y rests at 0, where exp(a y) is 1, and nothing moves it; from elsewhere both are told."""
     rates = {"y": "k*(exp(a*y)-1)"}
     assert lost(model(rates, {"y": "0"}, {"r": "y"}, {})) == ("a", "k")
@@ -336,7 +336,7 @@ def require_the_same_of_compartments(seeds):
     "parameters judged wrongly, counted, of 4 drawn models",
     0,
 )
-def test_compartments_by_their_transfer_function():
+def test_compartments_lose_what_the_rank_of_their_transfer_function_says():
     require_the_same_of_compartments(range(4))
 
 
@@ -346,12 +346,12 @@ def test_compartments_by_their_transfer_function():
     0,
 )
 @pytest.mark.slow
-def test_many_compartments_by_their_transfer_function():
+def test_many_compartments_lose_what_the_rank_of_their_transfer_function_says():
     require_the_same_of_compartments(range(4, 304))
 
 
 @pytest.mark.parametrize("expression", FORMULAS)
-def test_formulas(expression):
+def test_a_formula_loses_the_parameters_that_it_has_only_together(expression):
     start = {
         name: 1.0 for name in "abcn" if name in expression.replace("exp", "").replace("sqrt", "")
     }

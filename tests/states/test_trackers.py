@@ -75,7 +75,7 @@ DEAR = ("IEKF", "IPLF", "CKF", "GHKF")
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow if n in DEAR else ()) for n in BOOK]
 )
-def test_the_twelve_figures_of_the_book(name, stored):
+def test_errors_of_filters_and_smoothers_are_the_twelve_figures_of_the_book(name, stored):
     (rule, iterations, filtered, smoothed), (x, z) = BOOK[name], stored
     first = Filter(rule, iterations)
     smoother = IteratedSmoother(first, rule) if iterations > 1 else Smoother(first)
@@ -239,7 +239,7 @@ def test_points_of_an_angle_lie_about_that_of_their_centre(rule, m):
     )
 
 
-def test_bearings_come_round():
+def test_a_track_is_kept_where_its_bearing_comes_round():
     """A turn whose track crosses the negative x axis: without wrapping the filters lose it at
     once."""
     model = CoordinatedTurn(count=60)
