@@ -147,15 +147,12 @@ def _recalled(task: Task) -> tuple[ResultKey, ...]:
         _recent.clear()
     for cell in task.cells:
         known = _recent.get(cell.key)
-        if known is None or not _has_same_classes(known, cell):
+        if known is None or component_classes(known.components) != component_classes(
+            cell.components
+        ):
             _require_same_source(cell)
             _recent[cell.key] = cell
     return tuple(_recent[cell.key] for cell in task.cells)
-
-
-def _has_same_classes(known: ResultKey, cell: ResultKey) -> bool:
-    """Tells whether cells of one key are of the same classes: a notebook may define one anew."""
-    return component_classes(known.components) == component_classes(cell.components)
 
 
 def _require_same_source(cell: ResultKey) -> None:
