@@ -524,6 +524,18 @@ def test_beside_long_names_labels_of_scales_stand_apart_and_no_leader_crosses_a_
         )
 
 
+@pytest.mark.parametrize(("letters", "labels"), [(14, 1), (15, 2)])
+def test_curves_that_end_at_one_place_share_a_label_of_thirty_letters_at_most(letters, labels):
+    """Two names, a comma and a blank."""
+    names = ["e" * 14, "f" * letters]
+    rows = pd.DataFrame({"estimator": names, "error_scale": 1.0, "success": 0.5})
+    with house_style():
+        _, (ax,) = common.panels(1)
+        common.shares(ax)
+        common.end_names(ax, rows, "success", looks(names))
+    assert sum(isinstance(one, AnnotationBbox) for one in ax.artists) == labels
+
+
 def test_of_many_curves_those_of_the_success_picture_are_drawn_and_the_others_named(synthetic):
     labels = [f"e{i}" for i in range(12)]
     e = 0.1 * np.random.default_rng(0).standard_normal((30, 3))
@@ -663,7 +675,7 @@ def with_collection() -> View:
 
 def test_digits_of_each_problem_are_in_its_cell_dark_from_four_on_the_hardest_first():
     digits = {
-        ("easy", "good"): 10.9,
+        ("easy", "good"): 8.2,
         ("easy", "bad"): 4.2,
         ("hard", "good"): 4.0,
         ("hard", "bad"): np.nan,
@@ -677,9 +689,11 @@ def test_digits_of_each_problem_are_in_its_cell_dark_from_four_on_the_hardest_fi
     (ax,) = drawing.figure.axes
     assert [t.get_text() for t in ax.get_yticklabels()] == ["hard", "easy"]
     assert [t.get_text() for t in ax.get_xticklabels()] == ["good", "bad"]
-    assert [t.get_text() for t in ax.texts] == ["4", "0", "10", "4"]
+    assert [t.get_text() for t in ax.texts] == ["4", "0", "8", "4"]
     fills = [to_hex(color) for color in ax.collections[0].get_facecolors()]
     assert [fill in RAMP[18:] for fill in fills] == [True, False, True, True]
+    # From eight digits on it is darkest.
+    assert fills.count(RAMP[20]) == 1
     assert "good solves 100 %" in drawing.caption
 
 

@@ -72,7 +72,7 @@ def draw_bounds(
     sizes = np.array([p.size for p in now.parameters])
     names = [common.text(with_unit(p.name, p.unit)) for p in now.parameters]
     width = 0.07 * max(map(len, names)) + 4.5
-    size = (min(width, 11.0), 1.1 + 0.26 * len(names))
+    size = (width, 1.1 + 0.26 * len(names))
     fig = Figure(figsize=size, layout="constrained")
     ax = fig.subplots()
     y = np.arange(len(names))
