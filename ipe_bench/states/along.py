@@ -143,6 +143,17 @@ class EpochFunctions:
     def at(self) -> Mapping[int, Recording]:
         return {k: one.at(i) for one in self.recordings for i, k in enumerate(one.epochs.tolist())}
 
+    @cached_property
+    def recorded_epochs(self) -> list[int]:
+        """The epochs at which it is recorded, in order."""
+        recorded = [one for one in self.recordings if isinstance(one.function, RowFunction)]
+        return sorted(k for one in recorded for k in one.epochs.tolist())
+
+    @cached_property
+    def forms(self) -> set[Any]:
+        """What is recorded of it but for numbers."""
+        return {one.form for one in self.recordings if isinstance(one.function, RowFunction)}
+
     def places(self, K: int) -> tuple[Array, Array]:
         """Returns of each of K epochs (K,) which recording has it, and its place there."""
         which = np.zeros(K, dtype=int)
@@ -249,10 +260,9 @@ def renumbered(functions: EpochFunctions, model: StateModel, name: str) -> Epoch
     Raises:
         NotRecorded: it cannot be recorded any more.
     """
-    recorded = [one for one in functions.recordings if isinstance(one.function, RowFunction)]
-    epochs = sorted(k for one in recorded for k in one.epochs.tolist())
-    numbers = model.recorded_numbers(name, epochs) if recorded else {}
-    if {one.form for one in recorded} != set(numbers):
+    epochs = functions.recorded_epochs
+    numbers = model.recorded_numbers(name, epochs) if epochs else {}
+    if functions.forms != set(numbers):
         return None
     function = getattr(model, name)
     recordings = []
@@ -406,6 +416,8 @@ def astray(f: EpochFunctions, h: EpochFunctions, x: Array) -> Mask:
     """Finds the paths (trials,) among x (trials, 1 + K, n) at which recorded functions have not the
     values and slopes of the model's own: at some epochs of each path, and where it is lost."""
     wrong = np.zeros(len(x), dtype=bool)
+    if f.forms | h.forms <= {None}:
+        return wrong
     for functions, states in ((f, x[:, :-1]), (h, x[:, 1:])):
         known = np.asarray(np.isfinite(states).all(axis=2))
         for one in functions.recordings:
