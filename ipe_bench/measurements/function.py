@@ -227,7 +227,9 @@ class Function(WrittenModel):
 
     @property
     def input_columns(self) -> Mapping[str, Sequence[Any]]:
-        return super().input_columns | ({"output": self.output} if self.outputs else {})
+        if not self.outputs:
+            return super().input_columns
+        return {**super().input_columns, "output": self.output}
 
     @property
     def periods(self) -> Array | Sequence[float]:
