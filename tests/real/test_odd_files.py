@@ -88,7 +88,7 @@ def wrong_cells() -> Iterator[Case]:
         yield Case(
             f"{name} in {column}",
             with_cell(column, text),
-            rf"row 4, column {column}: .*; (correct it|leave)",
+            rf"row 4, column {column}: .*; (correct it|leave|write dates)",
         )
 
 

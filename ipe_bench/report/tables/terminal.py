@@ -273,9 +273,11 @@ def _success(row: Mapping[str, Any]) -> str:
 def _verdict(row: Mapping[str, Any]) -> str:
     """Words a verdict, with the largest factor of the variance that is not excluded."""
     verdict = row["verdict"]
-    if verdict not in (CONSISTENT, NOT_REFUTED):
+    high = row["nees_mean_high"]
+    # Results of 0.3 do not have it.
+    if verdict not in (CONSISTENT, NOT_REFUTED) or not math.isfinite(high):
         return shown(verdict)
-    return f"{shown(verdict)}, within {factor(row['nees_mean_high'])}"
+    return f"{shown(verdict)}, within {factor(high)}"
 
 
 def _of_claims(row: Mapping[str, Any]) -> str:
