@@ -30,6 +30,7 @@ from ipe_bench.real.readings import SIGMA, quantity, read_headings, read_tables
 from ipe_bench.report.words import enumerate_few
 
 _DATA = (".csv", ".tsv", ".txt", ".dat", ".parquet")
+_NUMERIC = re.compile(r"\s*[-+]?[.,]?\d")
 _SHEETS = (".xlsx", ".xls", ".ods", ".numbers")
 _YAML = (".yaml", ".yml")
 _FUNCTION = re.compile(r"(?P<file>.+\.py)(:(?P<name>\w*))?")
@@ -321,12 +322,13 @@ class _Reader:
 
     @cached_property
     def texts(self) -> list[str]:
-        """Columns of the first file that have texts and no number, such as remarks."""
+        """Columns of the first file whose cells are texts that begin with no number, such as
+        remarks: 20 °C may be a reading."""
         (table,) = read_tables([Path(self.files[0])])
         found = []
         for heading in table.heading:
             cells = [text for text, _ in table.column(heading) if text.strip()]
-            if cells and all(table.number(text) is None for text in cells):
+            if cells and not any(_NUMERIC.match(text) for text in cells):
                 found.append(quantity(heading))
         return found
 

@@ -352,6 +352,16 @@ def test_texts_beside_the_readings_are_left_out_and_said(
     assert question.found.z.tolist() == [98.8, 95.1]
 
 
+def test_a_column_whose_texts_begin_with_numbers_is_not_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may be the readings, with a unit in each cell, or their dates."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.csv").write_text("t,temperature,volt\n1,20 °C,3.4\n2,21 °C,5.2\n")
+    with pytest.raises(UserError, match="columns temperature, volt are not in the formula"):
+        shorts.read("estimate", ["a*t", "own.csv"])
+
+
 def test_repeated_readings_and_scalar_functions_are_refused_with_what_to_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
