@@ -27,9 +27,9 @@ NAMES = {
         *("_ITERATIONS", "_TRIED", "_PER_DECADE", "_NEAR_ROOT", "_CHORDS"),
         *("_JACOBIANS", "_BENT", "_CONTRACTING", "_DEPTH"),
     ),
-    "starts": ("LONG", "_PROMISING", "_SHORT", "_APART", "_LOOKS", "_HALVINGS"),
+    "starts": ("LONG", "_PROMISING", "_SHORT", "_APART", "_LOOKS"),
     "windows": (
-        *("_DAMPING", "_FIRST_ITERATIONS", "_SLOW_GROWTH", "_FIRST_DRAWS", "_RANDOMISED"),
+        *("_DAMPING", "_FIRST_ITERATIONS", "_FIRST_DRAWS", "_RANDOMISED"),
         *("_AS_BAD", "_CAREFUL_ITERATIONS", "_THINNING", "_GIVEN_UP", "_ONE"),
     ),
     "progressive": ("_SAME_FIT", "_BULK", "_READINGS", "_TRUSTED", "_WORTH"),
