@@ -494,8 +494,8 @@ CHANGES = {
     "scale-forgotten": Change(
         "priors",
         "an error scale widens the draws alone",
-        "return error_scale * (np.ones(n) if self.deviations is None",
-        "return (np.ones(n) if self.deviations is None",
+        "return error_scale * of_each",
+        "return of_each",
         "test_scenario.py test_scoring.py",
     ),
     "never-diverged": Change(
@@ -819,10 +819,10 @@ CHANGES = {
         "test_displays.py",
     ),
     "lacking-unsaid": Change(
-        "api",
+        "questions",
         "compare passes over what the second lacks",
-        'frame.attrs["problems"] += lacking',
-        'frame.attrs["problems"] += []',
+        "list(gone(ours, theirs, versions)) if complete else []",
+        "[]",
         "test_compare.py",
     ),
     "problems-pass": Change(
@@ -835,10 +835,8 @@ CHANGES = {
     "estimate-passes": Change(
         "cli",
         "estimate exits with 0 though no fit passes",
-        "has the numbers\n    say_files([stored, *write_page(folder, answer, provenance,"
-        " figures=drawn)])\n    return 0 if answer.passes else 1",
-        "has the numbers\n    say_files([stored, *write_page(folder, answer, provenance,"
-        " figures=drawn)])\n    return 0",
+        "return 0 if all(answer.passes for answer in found) else 1",
+        "return 0",
         "test_estimate.py",
     ),
     "figures-drawn": Change(
@@ -887,8 +885,8 @@ CHANGES = {
     "no-minimum": Change(
         "real",
         "resampled readings without a minimum count as answered",
-        "found[i] = False",
-        "found[i] = True",
+        "found[beyond] = False",
+        "found[beyond] = True",
         "test_examination.py",
     ),
     "tail-floor": Change(
