@@ -99,7 +99,7 @@ def test_posteriors_exit_with_1_unless_the_populations_of_every_trial_agree(
 
 
 def test_an_experiment_that_sweeps_needs_a_value_of_its_key(ipe_bench):
-    code, _, err = ipe_bench("design", "+experiment=paper")
+    code, _, err = ipe_bench("design", "+experiment=polynomial")
     assert code == 2
-    assert "sweeps over 5 settings" in err
-    assert ipe_bench("design", "+experiment=paper", "error_scale=10")[0] == 0
+    assert "sweeps over 3 settings" in err
+    assert ipe_bench("design", "+experiment=polynomial", "error_scale=10")[0] == 0
