@@ -461,7 +461,9 @@ def test_figures_of_many_questions_tell_all_apart(kind, seed, tmp_path):
     assert list(faults_of_question(kind, seed, tmp_path)) == []
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "seed", [*(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 1)), 2, 3]
+)
 def test_what_is_shown_counts_every_trial(seed):
     assert list(faults(seed)) == []
 

@@ -614,7 +614,9 @@ def shown(found: list[Tally]) -> str:
     return "\n".join([head, *lines])
 
 
-@pytest.mark.parametrize("first", range(0, 50, 10))
+@pytest.mark.parametrize(
+    "first", [0, 10, *(pytest.param(first, marks=pytest.mark.slow) for first in (20, 30, 40))]
+)
 def test_what_a_report_counts_is_so(first):
     found = [claim for seed in range(first, first + 10) for claim in judged(seed, largest=False)]
     assert len(found) > 100
