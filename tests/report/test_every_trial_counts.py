@@ -21,6 +21,7 @@ import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
 from report.test_paper import read
+from shared.families import slow_if
 from shared.random_results import results
 from shared.synthetic_store import Synthetic
 
@@ -461,9 +462,7 @@ def test_figures_of_many_questions_tell_all_apart(kind, seed, tmp_path):
     assert list(faults_of_question(kind, seed, tmp_path)) == []
 
 
-@pytest.mark.parametrize(
-    "seed", [*(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 1)), 2, 3]
-)
+@pytest.mark.parametrize("seed", slow_if(lambda seed: seed < 2, range(4)))
 def test_what_is_shown_counts_every_trial(seed):
     assert list(faults(seed)) == []
 

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import beta
+from shared.families import slow_if
 from shared.simulated_reports import HOLDING, Report, board, simulated
 from shared.synthetic_store import Filter, Pretender, Seeker
 
@@ -614,9 +615,7 @@ def shown(found: list[Tally]) -> str:
     return "\n".join([head, *lines])
 
 
-@pytest.mark.parametrize(
-    "first", [0, 10, *(pytest.param(first, marks=pytest.mark.slow) for first in (20, 30, 40))]
-)
+@pytest.mark.parametrize("first", slow_if(lambda first: first > 10, range(0, 50, 10)))
 def test_what_a_report_counts_is_so(first):
     found = [claim for seed in range(first, first + 10) for claim in judged(seed, largest=False)]
     assert len(found) > 100

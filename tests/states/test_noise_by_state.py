@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from shared.families import slow_if
 from shared.oracles import assert_agrees
 from shared.state_models import ConstantVelocity
 
@@ -434,7 +435,11 @@ TURNING = Formulas(
 
 
 @pytest.mark.parametrize(
-    "label", ["ekf", "iplf", "ukf_rts", "ieks", "ipls", "lm_ieks", "ipe_newton", "bootstrap"]
+    "label",
+    slow_if(
+        lambda label: label in ("iplf", "ieks", "ipls", "lm_ieks"),
+        ["ekf", "iplf", "ukf_rts", "ieks", "ipls", "lm_ieks", "ipe_newton", "bootstrap"],
+    ),
 )
 def test_a_heading_that_is_kept_within_half_a_turn_is_tracked_as_one_that_is_not(label):
     """Only the branch differs, of the heading's true path, its transition and what the compass

@@ -60,6 +60,7 @@ def test_trackers_of_singular_covariances_are_calibrated():
     assert len(table) == len(TRACKERS) * (len(Gins().parameters) + 1)  # the motion is not scored
 
 
+@pytest.mark.slow
 def test_a_smoothed_covariance_stays_definite_where_readings_leave_little_of_a_wide_prior():
     """It was indefinite by round-off, and posterior linearisation about it lost every trial."""
     model = StateScenario(WalkingGins(), error_scale=100.0).assumed
