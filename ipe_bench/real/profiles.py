@@ -7,7 +7,8 @@ Analysis and Its Applications, 1988, section 6.1).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,9 @@ _DECADES = 30.0
 """Decades of a bounded parameter's distance to its bound beyond which no end is searched for."""
 _STRETCHES = 27
 """The most steps outwards."""
+_FLAT = 0.01
+"""The share of what is left to the limit by which a profile rises at most while the distance
+doubles, twice, where it is followed no further: a hundred doublings would not end it."""
 _STRAIGHT = 0.02
 """The share by which a rise differs at most from that of a linear model where steps may be
 large."""
@@ -39,11 +43,15 @@ _EXACT = 1e-6
 _PRECISION = 1e-8
 """The precision of an end, as a share of its distance and of the half-width."""
 _JUMP = 0.01
+"""A rise just before an end that is smaller than there by more than this share has jumped."""
+_LOWER_VALLEY = 0.004
 """A rise at an end that is smaller than it should be by more than this share is that of another
-valley."""
+valley: chi-square has then risen by less than 0.99 of its limit."""
 _STEP = 1e-4
 """The share of the distance to an end within which a rise does not fall that far, unless minima
 were lost there."""
+_NEAR_ZERO = 1e-6
+"""The share of an estimate within which of 0 a jump of its profile is at 0."""
 _LIMITS = Limits(1e-7, 100)
 _LOWER = 1e-6
 """A chi-square that is smaller than at the estimate by more than this is that of a lower
@@ -174,21 +182,31 @@ def profiles(
     least = float(objective.cost(x[None], objective.residual(x[None]))[0])
     slope = model.physical_slope(x[None])[0]
     limits = natural_limits(model)
+    sought = range(len(x)) if places is None else places
+    sides = {
+        (k, sign): _Side(
+            problem, z, x, P, k, sign, float(q[k]), float(behind[k]), least, objective, released
+        )
+        for k in sought
+        for sign in signs
+    }
+    for side in sides.values():
+        side.follow()
+    for (k, _), side in sides.items():
+        side.follow_from([other for (place, _), other in sides.items() if place != k])
     found = []
-    for k in range(len(x)) if places is None else places:
+    for k in sought:
         ends = repeated(x, 2)
-        common = (float(q[k]), float(behind[k]), least, objective, released)
-        below, above = (_Side(problem, z, x, P, k, s, *common) for s in (-1, 1))
-        try:
-            low = below.end() if -1 in signs else np.inf
-            high = above.end() if 1 in signs else np.inf
-            free = len(signs) == 2 and np.isinf([limits[0][k], limits[1][k]]).all()
-            if free and np.isinf(low) and np.isfinite(high) and above.continues(below):
+        low, high = (sides[k, sign].end if sign in signs else np.inf for sign in (-1, 1))
+        if len(signs) == 2 and np.isinf([limits[0][k], limits[1][k]]).all():
+            below = sides[k, -1]
+            above = sides[k, 1]
+            if np.isinf(low) and not np.isinf(high) and above.continues(below):
                 high = np.inf
-            elif free and np.isinf(high) and np.isfinite(low) and below.continues(above):
+            elif np.isinf(high) and not np.isinf(low) and below.continues(above):
                 low = np.inf
-            ends[:, k] += [-low, high]
-        except _BetterFit:
+        ends[:, k] += [-low, high]
+        if any(sides[k, sign].beaten for sign in signs):
             ends[:, k] = np.nan
         with np.errstate(invalid="ignore"):
             values = model.physical(ends)[:, k]
@@ -228,31 +246,81 @@ class _Side:
     def __post_init__(self) -> None:
         self.seen: dict[float, tuple[float, Array]] = {0.0: (0.0, self.x)}
         """The rise up to twice q, and the parameters, by distance from the estimate."""
+        self.end = np.nan
+        """The distance to the end; infinite if there is none, NaN if minima cannot be followed to
+        it."""
+        self.beaten = False
+        """Whether a better fit than the estimate was met."""
 
-    def end(self) -> float:
-        """Finds the distance to the end; infinite if there is none, NaN if minima cannot be
-        followed to it."""
+    def follow(self) -> None:
+        """Follows the profile from the estimate to its end."""
+        half = self._half
+        with self._watched():
+            straight = self._straight_to(half)
+            self.end = half if straight else self._outwards(0.0, 0.0, half / 8)
+
+    def follow_from(self, others: Sequence[_Side]) -> None:
+        """Follows the profile on from its end if the minima of the other parameters' profiles lead
+        to a lower valley there."""
+        alone = not others or linear(self.problem.measurement)
+        if alone or self.beaten or not np.isfinite(self.end):
+            return
+        far = self.end
+        with self._watched():
+            risen = self.rise(far, further=np.array([one.nearest(self, far) for one in others]))
+            if risen < (1 - _LOWER_VALLEY) * self.q:
+                self.seen = {far: self.seen[far]}
+                self.end = self._outwards(far, risen, 1.1 * far)
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        try:
+            yield
+        except _BetterFit:
+            self.beaten = True
+
+    @property
+    def _decade(self) -> float:
+        return float(decades(self.problem.measurement, self.x)[self.place])
+
+    @property
+    def _half(self) -> float:
+        """The half-width by the standard error."""
         half = self.q * float(np.sqrt(self.P[self.place, self.place]))
-        decade = float(decades(self.problem.measurement, self.x)[self.place])
-        if self._straight_to(half):
-            return half
         # A logarithm of which nothing is known may have any standard error.
-        half = min(half, 8 * decade)
-        near = 0.0
-        before = 0.0
-        far = half / 8
+        return min(half, 8 * self._decade)
+
+    def nearest(self, other: _Side, distance: float) -> Array:
+        """Returns the point of this profile that is nearest to a distance along the other one."""
+        at = other.x[other.place] + other.sign * distance
+        points = [point for _, point in self.seen.values()]
+        return min(points, key=lambda point: abs(point[other.place] - at))
+
+    def _outwards(self, near: float, before: float, far: float) -> float:
+        """Finds the distance to the end by steps from a distance `far` on; `near` and `before` are
+        the distance and the rise that precede it."""
+        half = self._half
+        decade = self._decade
+        flat = 0
         for _ in range(_STRETCHES):
             if far > _DECADES * decade:
                 break
             risen = self.rise(far)
             if risen >= self.q:
                 far = self._crossing(near, far, half)
-                risen = self.rise(far, around=True)
-                if risen >= (1 - _JUMP) * self.q:
-                    before = self.rise((1 - _STEP) * far)
-                    return far if before >= (1 - _JUMP) * self.q else np.nan
+                risen = self.rise(far, further=self._around(far))
+                if risen >= (1 - _LOWER_VALLEY) * self.q:
+                    if self.rise((1 - _STEP) * far) >= (1 - _JUMP) * self.q:
+                        return far
+                    # As a factor of the model goes to 0, the others may make up for it to the last.
+                    zero = float(-self.sign * self.x[self.place])
+                    return zero if abs(far - zero) <= _NEAR_ZERO * zero else np.nan
                 # Another valley is lower here: the search goes on along that.
                 self.seen = {far: self.seen[far]}
+            doubled = near >= half and far >= 1.99 * near
+            flat = flat + 1 if doubled and abs(risen - before) < _FLAT * (self.q - risen) else 0
+            if flat == 2:
+                break
             # Small steps where the profile bends, since it may rise beyond q and fall again within
             # a large one.
             straight = abs(risen * half / (far * self.q) - 1) < _STRAIGHT
@@ -305,16 +373,16 @@ class _Side:
                 low /= 2 if turns > 0 else 1
                 turns = 1
 
-    def rise(self, distance: float, *, around: bool = False) -> float:
+    def rise(self, distance: float, *, further: Array | None = None) -> float:
         """Computes the rise of root chi-square at a distance; that of the least minimum found from
-        the profile's nearest points and, if asked, from all around, where another valley may be
-        lower."""
-        if distance in self.seen and not around:
+        the profile's nearest points and from `further` starts (starts, n), where another valley may
+        be lower."""
+        if distance in self.seen and further is None:
             return self.seen[distance][0]
         at = float(self.x[self.place] + self.sign * distance)
         starts = self._starts(distance, at)
-        if around:
-            starts = np.vstack([starts, self._around(at)])
+        if further is not None:
+            starts = np.vstack([starts, further])
         point, total = _least_at(self.problem, self.z, self.place, at, starts, self.released)
         risen = self._risen(total)
         self.seen[distance] = risen, point
@@ -351,11 +419,12 @@ class _Side:
         points = [self.seen[d][1] for d in (nearest, *beyond[:1])]
         return np.vstack([_ahead(self.objective, points[0], self.place, at), *points])
 
-    def _around(self, at: float) -> Array:
+    def _around(self, distance: float) -> Array:
         """Returns starts (starts, n) two deviations of the others to both sides of a linear model's
         prediction from the estimate, along each axis of their covariance."""
         P = self.P
         place = self.place
+        at = float(self.x[place] + self.sign * distance)
         gain = P[:, place] / P[place, place]
         # The covariance of the others if this one is known.
         left = P - np.outer(gain, P[place])

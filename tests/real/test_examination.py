@@ -358,3 +358,56 @@ def test_without_draws_there_are_no_bootstrap_intervals():
     found = examine(problem, z, fit(problem, z, LM, Gaussian(0.01)), bootstraps=0)
     assert np.isnan(found.bootstrap.low).all()
     assert np.isnan(found.bootstrap.high).all()
+
+
+def ends(formula, start, t, z):
+    """The profile intervals by name, and the sum of squares at their ends."""
+    model = Formula(formula, start, {"t": t.tolist()})
+    found = ib.estimate(model, z, {"lm": LevenbergMarquardt()}).examination
+    freedom = len(z) - model.n
+    limit = found.chi_square * found.problem.R.deviations[0] ** 2
+    limit *= 1 + t_law.ppf(0.975, freedom) ** 2 / freedom
+    return dict(zip(start, np.transpose(found.profiles), strict=True)), limit
+
+
+def test_an_end_is_that_of_the_lowest_valley_and_a_flat_profile_has_none():
+    """Noisy readings of Hill's curve, which a step fits nearly as well: the end of the place is by
+    a scan over all steepnesses, in which the height is linear."""
+    t = np.linspace(0.2, 6.0, 18)
+    z = np.array([-0.126, 0.164, 0.204, 0.166, 0.218, 0.089, 1.277, 1.048, 1.949, 1.606, 1.568])
+    z = np.append(z, [1.399, 2.067, 1.591, 2.241, 1.725, 1.931, 1.475])
+    found, limit = ends("V*t^n/(K^n+t^n)", {"V": 1.8, "K": 2.2, "n": 9.0}, t, z)
+
+    def squares(K, n):
+        f = 1 / (1 + (K / t) ** n)
+        return np.sum((z - (f @ z) / (f @ f) * f) ** 2)
+
+    # Steps have the same curve between two readings, and the end is close to the lower one.
+    assert min(squares(1.93, n) for n in np.geomspace(1.0, 250.0, 4000)) < limit
+    assert t[5] < found["K"][0] < 1.93
+    assert found["n"][1] == np.inf
+    assert min(squares(K, 250.0) for K in np.linspace(2.0, 2.6, 200)) < limit
+
+
+def test_a_profile_that_jumps_beyond_zero_ends_there():
+    """Of Gompertz's curve: as a goes to 0 an exponential growth makes up for it, and a curve that
+    is negative cannot."""
+    t = np.linspace(0.0, 8.0, 11)
+    z = np.array([1.168, 0.422, 1.402, 2.491, 3.726, 1.156, 2.954, 2.794, 2.416, 3.665, 3.393])
+    found, limit = ends("a*exp(-b*exp(-c*t))", {"a": 3.3, "b": 1.5, "c": 0.45}, t, z)
+    assert found["a"].tolist() == [pytest.approx(0.0, abs=1e-6), np.inf]
+    small = 1e-7 * np.exp(16.43 * np.exp(0.00722 * t))
+    assert np.sum((z - small) ** 2) < limit < np.sum(z**2)
+
+
+def test_a_profile_that_is_lost_on_the_way_to_where_the_other_end_comes_from_has_no_end():
+    """Of a + b t^c the factor is 0 only if the curve is a constant, which the readings exclude; a
+    negative factor, with a curve that goes on rising, they do not."""
+    t = np.linspace(0.2, 8.0, 17)
+    z = np.array([2.167, 1.867, 1.965, 4.159, 5.531, 4.142, 2.56, 3.134, 6.478, 4.995, 2.848])
+    z = np.append(z, [5.059, 3.941, 4.782, 5.14, 5.048, 6.768])
+    found, limit = ends("a+b*t^c", {"a": 0.9, "b": 2.0, "c": 0.4}, t, z)
+    assert found["b"].tolist() == [-np.inf, np.inf]
+    assert np.sum((z - np.mean(z)) ** 2) > limit
+    curves = (-2.0 * t**c for c in np.linspace(-1.0, -0.1, 100))
+    assert min(np.sum((z - h - np.mean(z - h)) ** 2) for h in curves) < limit
