@@ -624,6 +624,9 @@ class _Reader:
     def _require_complete(self, file: str, content: dict[str, Any], group: str, cls: type) -> None:
         """Refuses a file with keys that mean nothing, or without those that are needed."""
         options = {one.name: one for one in fields(cls) if one.init}
+        for name, one in options.items():
+            if name in content and str(one.type).startswith("Mapping"):
+                _require_entries(file, content, name)
         said = []
         for key in [str(key) for key in content if key not in options]:
             near = [name for name in options if name[:_ALIKE] == key[:_ALIKE]]
@@ -649,6 +652,19 @@ class _Reader:
         if misnamed:
             remedy = f"its keys are {', '.join(options)}"
         raise UserError(f"{file}: {'; '.join(said)}; {remedy}")
+
+
+def _require_entries(file: str, content: dict[str, Any], key: str) -> None:
+    """Refuses a list, a number or nothing where names with values belong."""
+    given = content[key]
+    if isinstance(given, dict):
+        return
+    like = content.get(_NAMED_LIKE.get(key, ""))
+    names = given if isinstance(given, list) else list(like) if isinstance(like, dict) else []
+    usual = {"inputs": 0, **dict.fromkeys(("next", "readings", "rates", "outputs"), "FORMULA")}
+    value = given if isinstance(given, int | float | str) else usual.get(key, 1)
+    entries = ", ".join(f"{name}: {value}" for name in names or ["NAME"])
+    raise UserError(f"{file}: {key} has no names with values; write {key}: {{{entries}}}")
 
 
 def _undefined(content: dict[str, Any]) -> list[str]:
