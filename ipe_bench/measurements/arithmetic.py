@@ -147,6 +147,10 @@ def parse(text: str, where: str) -> Arithmetic:
     source = _NAME.sub("_", " ".join(text.split()).replace("^", "**"))
     try:
         if not _ALPHABET.fullmatch(text):
+            if "[" in text:
+                raise SyntaxError(
+                    "a list has no meaning; a table is interp(x, x1, y1, x2, y2, ...)"
+                )
             raise SyntaxError("a character has no meaning here")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -193,6 +193,7 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
         (["a*t", "+", "b", "line.csv"], "put a formula in quotes"),
         (["falling.py", "falling.csv", "measurement=gins"], "and measurement=gins is another"),
         (["a*t+b)", "line.csv"], "is not a formula at ')'"),
+        (["a*interp(t, [0, 9], [1, 2])", "line.csv"], "a table is interp(x, x1, y1, x2, y2, ...)"),
         (["a*exq(t)", "line.csv"], "exq(...): there is no such function; did you mean exp?"),
         (
             ["a*tt+b", "line.csv"],
