@@ -25,7 +25,7 @@ from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel, require_parts
 from ipe_bench.states.copies import SURE
 from ipe_bench.states.formulas import Formulas, RecordedFormulas
-from ipe_bench.states.left_out import Expected
+from ipe_bench.states.left_out import MOST_LEFT_OUT, Expected
 from ipe_bench.states.lost import why_lost
 from ipe_bench.states.particles import Bootstrap
 from ipe_bench.states.redone import unchanged
@@ -58,9 +58,9 @@ _FAR_BELOW = 10.0
 """By how much more than a tenth of the number of readings a log likelihood lies far below the
 largest of the log."""
 _MOST_OUTLIERS = 5
-_MOST_GATED = 0.2
-"""Share of readings beyond the gate above which the model is wrong."""
 _MOST_GATED_SHOWN = 10
+_HARDLY = 0.1
+"""Weight below which a reading hardly counts."""
 _FEW = 3
 _SHARE = 0.05
 """Share of outliers above which the model is wrong, and no list of epochs helps."""
@@ -324,6 +324,9 @@ class LogTracks:
     """The verdict on the search for them; empty if one maximum was found."""
     gated: Mask | None = None
     """Readings (K, m) beyond the gate, which are left out; None without a gate."""
+    weights: Array | None = None
+    """By how much readings (K, m) count, in parts of one that is as expected, if their noise is
+    Student's t; NaN of missing ones."""
     share_gated: float = 0.0
     """Their share of all readings."""
     notes: Sequence[str] = ()
@@ -339,6 +342,7 @@ class LogTracks:
         innovations = tracks.innovations.swapaxes(1, 2)
         predicted, predicted_deviation = tracks.predicted_readings(log.z[None])
         gated = None if tracks.gated is None else tracks.gated[0]
+        weights = None if tracks.weights is None else tracks.weights[0]
         missing = np.isnan(log.z)
         share = 0.0
         if gated is not None:
@@ -374,7 +378,7 @@ class LogTracks:
         whole = bool(np.isfinite([mean, deviation]).all())
         fits = not fit_p < FIT_LEVEL and not white < FIT_LEVEL
         held = not effective < _COLLAPSED and lost_from is None
-        if share > _MOST_GATED:
+        if share > MOST_LEFT_OUT:
             message = (
                 f"{100 * share:.0f} % of the readings lie beyond the gate, where a few should: the"
                 " model or its noise does not fit the log"
@@ -393,17 +397,19 @@ class LogTracks:
             fit_p=fit_p,
             white_p=white,
             log_likelihood=float(tracks.log_likelihood[0]) if tracks.degrees.any() else np.nan,
-            passes=whole and fits and held and share <= _MOST_GATED and ended == Status.CONVERGED,
+            passes=whole and fits and held and share <= MOST_LEFT_OUT and ended == Status.CONVERGED,
             message=messages.get(0, message),
             lost_from=lost_from,
             effective=effective,
             smooths=tracker.smooths,
             notes=[
                 *_second(log, tracks),
-                *_left_out(log, gated),
+                *_left_out(log, gated, "left out, as beyond the gate"),
+                *_left_out(log, distrusted(weights), "counted by less than a tenth"),
                 *_worst(log, nis, tracks.degrees[0], lost_from),
             ],
             gated=gated,
+            weights=weights,
             share_gated=share,
         )
 
@@ -418,7 +424,7 @@ class LogTracks:
             return COLLAPSED
         if self.found:
             return self.found
-        if self.share_gated > _MOST_GATED:
+        if self.share_gated > MOST_LEFT_OUT:
             return WRONG
         if np.isnan(self.mean_nis):
             return NO_VERDICT
@@ -492,17 +498,22 @@ def _blind_from(gated: Mask, given: Mask, gate: float) -> int | None:
     return int(lost[0]) + 1 if len(lost) else None
 
 
-def _left_out(log: Log, gated: Mask | None) -> list[str]:
-    """Words the readings beyond the gate."""
-    if gated is None or not gated.any():
+def distrusted(weights: Array | None) -> Mask | None:
+    """Tells which readings hardly count by their weights."""
+    return None if weights is None else weights < _HARDLY
+
+
+def _left_out(log: Log, out: Mask | None, what: str) -> list[str]:
+    """Words the readings that are left out, or what else is said of them."""
+    if out is None or not out.any():
         return []
-    at = np.argwhere(gated)
+    at = np.argwhere(out)
     names = log.model.reading_names
     listed = [f"{k + 1}" if len(names) == 1 else f"{k + 1} ({names[j]})" for k, j in at]
     further = len(listed) - _MOST_GATED_SHOWN
     others = f" and {further} more" if further > 0 else ""
     return [
-        f"left out, as beyond the gate: {len(at)} of {np.isfinite(log.z).sum()} readings, at time"
+        f"{what}: {len(at)} of {np.isfinite(log.z).sum()} readings, at time"
         f" steps {', '.join(listed[:_MOST_GATED_SHOWN])}{others}"
     ]
 

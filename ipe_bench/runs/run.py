@@ -164,6 +164,12 @@ def _with_trackers(
 ) -> list[str]:
     found = {label: tracker.hindrance(scenario.assumed) for label, tracker in trackers.items()}
     mistakes = [f"trackers.{label}: {why}" for label, why in found.items() if why]
+    if scenario.assumed.degrees_of_freedom:
+        mistakes += [
+            f"trackers.{label}: has a gate, which readings of Student's t need not; remove one"
+            for label, tracker in trackers.items()
+            if tracker.gate is not None
+        ]
     if not scenario.noise.real and (untried is None or scenario in untried):
         mistakes += _without_paths(scenario)
     return mistakes

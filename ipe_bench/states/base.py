@@ -29,10 +29,12 @@ from ipe_bench.states.along import (
     renumbered,
     written_by_epoch,
 )
+from ipe_bench.states.student import Tails
 
 _FUNCTIONS = ("transition", "observe")
-_START, _PROCESS, _READINGS = range(3)
-"""The random streams of a trial: its start, its process noise and the noise of its readings."""
+_START, _PROCESS, _READINGS, _TAILS = range(4)
+"""The random streams of a trial: its start, its process noise, the noise of its readings, and
+how large the latter is."""
 
 
 class Normal(NamedTuple):
@@ -92,10 +94,10 @@ class StateModel(Component, ABC):
     Required: `states`, `times`, `prior`, `transition` (f), `observe` (h), `gain` (G) and `R`; if
     noise depends on the states, `gain_at(x, k)` in place of `gain(k)`, for the states x[k-1], or
     `R_at(x, k)` in place of `R(k)`. Optional: `moved_first`, `periods`, `state_periods`,
-    `reading_names` and `scored`; `draw`, if paths are stored; `log_inputs`, `with_log` and
-    `faults`, if a log has known inputs; `alike`, if a transition is long. Promised: f and h take
-    stacks of states (..., n); a trial has the same bits alone and in any batch; `require_sound`
-    finds nothing to refuse.
+    `reading_names`, `degrees_of_freedom` and `scored`; `draw`, if paths are stored; `log_inputs`,
+    `with_log` and `faults`, if a log has known inputs; `alike`, if a transition is long. Promised:
+    f and h take stacks of states (..., n); a trial has the same bits alone and in any batch;
+    `require_sound` finds nothing to refuse.
 
     Trackers run f and h as compiled code that is recorded from them with its slopes, if they depend
     on x and k alone and branch on no state (`np.where` is recorded); `remarks` says which ones run
@@ -326,6 +328,12 @@ class StateModel(Component, ABC):
         return ()
 
     @property
+    def degrees_of_freedom(self) -> tuple[float, ...]:
+        """The degrees of freedom of each reading whose noise is Student's t with the variance that
+        R has; infinite if it is normal. Empty: all are normal."""
+        return ()
+
+    @property
     def readings_per_epoch(self) -> int:
         return np.shape(self.R_at(self.prior.mean[None], 0))[-1]
 
@@ -445,6 +453,12 @@ class StateModel(Component, ABC):
         u = normals(_START, n)[:, : spread.shape[1]]
         w = normals(_PROCESS, K, q)
         v = normals(_READINGS, K, m)
+        for j, degrees in enumerate(self.degrees_of_freedom):
+            if np.isfinite(degrees):
+                # Of t it is v / sqrt(chi-square / nu), here of unit variance.
+                streams = numbered(seed, start, stop, _TAILS + j)
+                squares = np.array([g.chisquare(degrees, K) for g in streams])
+                v[..., j] *= np.sqrt((degrees - 2) / squares.reshape(trials, K))
         x = self.prior.mean + multiply(spread, u)
         paths = Paths(start=x, x=np.empty((trials, K, n)), z=np.empty((trials, K, m)))
         for k in range(K):
@@ -472,7 +486,7 @@ def widened(model: StateModel, scale: float) -> StateModel:
             "leave error_scale out"
         )
     m, P = model.prior
-    return _with_prior(model, Normal(m, scale**2 * P))
+    return _with(model, prior=_always(Normal(m, scale**2 * P)))
 
 
 def beginning_at(model: StateModel, start: Array) -> StateModel:
@@ -484,17 +498,34 @@ def beginning_at(model: StateModel, start: Array) -> StateModel:
     """
     if type(model).draw is not StateModel.draw:
         raise UserError(f"state_model={model.name}: has stored paths, and draws none")
-    return _with_prior(model, Normal(start, np.zeros((model.n, model.n))))
+    return _with(model, prior=_always(Normal(start, np.zeros((model.n, model.n)))))
 
 
-def _with_prior(model: StateModel, prior: Normal) -> StateModel:
-    parts = {
-        "__doc__": type(model).__doc__,
-        "name": model.name,
-        "prior": property(lambda self: prior),
-    }
+def told_alike(model: StateModel) -> StateModel:
+    """Returns the model with normal readings that tell as much of the states as its own do on
+    average, by their information: for bounds."""
+    tails = Tails.of(model.degrees_of_freedom)
+    if tails is None:
+        return model
+    size = np.sqrt(tails.information)
+    scale = size[:, None] * size
+    parts: dict[str, Any] = {"R": lambda self, k: scale * model.R(k)}
+    parts["covariances"] = lambda self, epochs: scale * model.covariances(epochs)
+    if model.R_by_state:
+        parts["R_at"] = lambda self, x, k: scale * model.R_at(x, k)
+    return _with(model, degrees_of_freedom=_always(()), **parts)
+
+
+def _always(value: Any) -> Any:
+    return property(lambda self: value)
+
+
+def _with(model: StateModel, **parts: Any) -> StateModel:
+    """Returns a copy of a model with other parts of its class."""
+    same = {"__doc__": type(model).__doc__, "name": model.name}
     other = copy.copy(model)
-    object.__setattr__(other, "__class__", type(type(model).__name__, (type(model),), parts))
+    changed = type(type(model).__name__, (type(model),), {**same, **parts})
+    object.__setattr__(other, "__class__", changed)
     return other
 
 
@@ -566,11 +597,13 @@ def _shape_faults(model: StateModel) -> Iterator[str]:
     last = model.epochs - 1
     periods = model.periods
     state_periods = model.state_periods
+    degrees = model.degrees_of_freedom
     parts = [
         ("the mean of the prior", x, (n,)),
         ("f", model.transition(x[None], last), (1, n)),
         ("h", model.observe(x[None], 0), (1, m)),
         ("periods", periods, (m,) if periods else (0,)),
+        ("degrees_of_freedom", degrees, (m,) if degrees else (0,)),
         ("reading_names", model.reading_names, (m,)),
         ("state_periods", state_periods, (n,) if state_periods else (0,)),
     ]
@@ -596,6 +629,9 @@ def _covariance_faults(model: StateModel) -> Iterator[str]:
         covariances.append((f"R of epoch {k + 1}", R[0] if model.R_by_state else R, m))
     for what, P, size in covariances:
         fault = _fault(P, size, regular=what.startswith("R"))
+        apart = np.array_equal(P, np.diag(np.diagonal(P)))
+        if model.degrees_of_freedom and what.startswith("R") and not apart:
+            fault = "is not diagonal; Student's t takes independent readings"
         if fault:
             yield f"{what} {fault}"
 

@@ -10,7 +10,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.states.affine_paths import Noise, Tangents
 from ipe_bench.states.algebra import factor, half, lower_solve, triangular
-from ipe_bench.states.base import Paths, StateModel
+from ipe_bench.states.base import Paths, StateModel, told_alike
 from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.trackers import Tracks, filtered, smoothed
 
@@ -23,11 +23,13 @@ def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
     over the drawn paths. Smoothing: the diagonal blocks of the inverse of the same information.
     Both are those of a linear model of the mean slopes, by roots: no covariance is inverted. They
     can lie far below what any estimator attains, where informations of single paths differ.
+    Readings of Student's t count by their information.
 
     Raises:
         UserError: the process noise of a step is singular, and a path has no density; or noise
         depends on the states.
     """
+    model = told_alike(model)
     root = triangular(model.prior.covariance[None])[0]
     n = model.n
     begun = root
@@ -145,7 +147,9 @@ def bound_at_truth(model: StateModel, paths: Paths, smooths: bool = False) -> Ar
     linearised at the true path (Taylor, IEEE TAC 24, 1979), or of the smoother behind it, which at
     the last epoch are the same. They exist for every Q, zero included; their mean is what a good
     filter attains, but no bound of errors averaged over paths. Noise that depends on the states has
-    its Q and R there, and tells no more of them by its size."""
+    its Q and R there, and tells no more of them by its size; noise of Student's t is as normal
+    noise that tells as much."""
+    model = told_alike(model)
     path = Tracks.empty(model, len(paths.x))
     path.start = path.start._replace(mean=paths.start)
     path.mean = paths.x

@@ -153,7 +153,7 @@ class LevenbergMarquardtSmoother(Tracker):
         three times more, and tells which round each path is of (trials,), 0 for one of none."""
         by = np.zeros(len(density.z), np.int64)
         again = np.zeros(len(density.z), np.int64)
-        rows = np.flatnonzero(self.improbable(density.z, paths.at.cost))
+        rows = np.flatnonzero(self.improbable(density.z, paths.at.misfit))
         for number in range(self.rounds if self.starts else 0):
             if not rows.size:
                 break
@@ -167,7 +167,7 @@ class LevenbergMarquardtSmoother(Tracker):
             # Where searches from elsewhere lead back, it is the model that does not fit.
             again[rows] = np.where(better, 0, again[rows] + alike)
             paths = paths.improved(other, rows)
-            sure = path_p(some.z, paths.at.cost[rows]) >= _SURE
+            sure = path_p(some.z, paths.at.misfit[rows]) >= _SURE
             rows = rows[~sure & (again[rows] < _BACK)]
         return paths, by
 
@@ -260,7 +260,7 @@ class LevenbergMarquardtSmoother(Tracker):
         raised = np.maximum(_FACTOR * damping, self.damping)
         damping = np.where(over, np.where(first, eased, damping), raised)
         # A search that crawls at an improbable cost hardly ever arrives.
-        improbable = self.improbable(density.z, at.cost)
+        improbable = self.improbable(density.z, at.misfit)
         hardly = improbable & (damping > 0) & (at.cost > _HARDLY * paths.at.cost)
         slow = np.where(over, np.where(hardly, paths.slow + 1, 0), paths.slow)
         tries = np.where(over, 0, paths.tries + 1)
@@ -298,7 +298,8 @@ def reported(density: PathDensity, paths: Descent) -> tuple[Tracks, Array]:
     out.start = Normal(at.x[:, 0], P[:, 0])
     out.mean = at.x[:, 1:]
     out.covariance = P[:, 1:]
-    out.cost = at.cost
+    out.cost = at.misfit
+    out.weights = density.weights(at)
     out.status = paths.status
     out.iterations = paths.iterations
     of_tangents = Taylor().calls(model.n) * model.evaluations

@@ -7,9 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from annotated_types import Gt, Le
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
@@ -28,6 +29,8 @@ from ipe_bench.measurements.arithmetic import Arithmetic, parse
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.states.along import Recording
 from ipe_bench.states.base import Normal, Numbered, Paths, StateModel
+
+Degrees = Annotated[float, Gt(2), Le(30)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +63,9 @@ class Formulas(StateModel):
     transition."""
     deviation: Mapping[str, NonNegative | str]
     """Standard deviation of each reading: a number, or a formula as those of the readings are."""
+    student: Mapping[str, Degrees] = field(default_factory=dict)
+    """Degrees of freedom, above 2 and up to 30, of each reading whose noise is Student's t with
+    that standard deviation: few readings lie far away. The others are normal."""
     start: Mapping[str, Finite] = field(default_factory=dict)
     """Mean of each state in the prior; 0 where absent."""
     spread: Mapping[str, NonNegative]
@@ -189,6 +195,12 @@ class Formulas(StateModel):
         mean = np.array([self.start.get(name, 0.0) for name in self.next], dtype=float)
         variances = [float(self.spread[name]) ** 2 for name in self.next]
         return Normal(mean, np.diag(variances))
+
+    @property
+    def degrees_of_freedom(self) -> tuple[float, ...]:
+        if not self.student:
+            return ()
+        return tuple(self.student.get(name, np.inf) for name in self.readings)
 
     @property
     def transition_names(self) -> tuple[str, ...]:
@@ -432,6 +444,7 @@ def _check_labels(model: Formulas) -> None:
     _check_values("deviation", model.deviation, model.readings, complete=True)
     _check_values("period", model.period, model.readings)
     _check_values("spread", model.spread, model.next, complete=True)
+    _check_values("student", model.student, model.readings)
     _check_values("start", model.start, model.next)
     _check_values("state_period", model.state_period, model.next)
 

@@ -17,7 +17,9 @@ from ipe_bench.engine import compiled
 from ipe_bench.engine.scan import Step
 from ipe_bench.engine.trace import Graph, Program
 
-_NAMES = ("information.py", "layouts.py", "linearisation.py", "passes.py", "steps.py")
+_NAMES = (
+    *("information.py", "layouts.py", "linearisation.py", "passes.py", "steps.py", "student.py"),
+)
 _FILES = [Path(__file__).with_name(name) for name in _NAMES]
 
 Shape: TypeAlias = "int | tuple[tuple[bool, ...], ...]"

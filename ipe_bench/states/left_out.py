@@ -14,8 +14,12 @@ from ipe_bench.states.linearisation import Taylor
 from ipe_bench.states.smoothers import whole
 from ipe_bench.states.trackers import Tracks, filtered, most_within
 
-_ROUNDS = 10
+MOST_LEFT_OUT = 0.2
+"""Share of readings beyond a gate above which a model is wrong, or a filter lost."""
+_ROUNDS = 30
 """Paths at most, after the first."""
+_BOTH_WAYS = 8
+"""Of these, those after which a reading that was left out may come back: sets may take turns."""
 
 
 class Expected(NamedTuple):
@@ -47,19 +51,23 @@ def leaving_out(
 ) -> Tracks:
     """Tracks paths by readings z (trials, K, m) without those beyond a quantile `gate`.
 
-    First these are what the extended filter leaves out. Then, until nothing changes, they are those
-    whose distance from the path of all other readings exceeds its standard deviation by too much:
-    with a residual r, its variance R and that of h at the smoothed state, s, r^2 / (R - s) of a
-    reading that the path knows, and r^2 / (R + s) of another one (deletion residuals: de Jong and
-    Penzer, JASA 93, 1998).
+    First these are what the extended filter leaves out, or none if it is lost. Then, until nothing
+    changes, they are those whose distance from the path of all other readings exceeds its standard
+    deviation by too much: with a residual r, its variance R and that of h at the smoothed state, s,
+    r^2 / (R - s) of a reading that the path knows, and r^2 / (R + s) of another one (deletion
+    residuals: de Jong and Penzer, JASA 93, 1998).
     """
     out = filtered(model, z, Taylor(), gate=gate).gated
     assert out is not None
+    share = out.sum(axis=(1, 2)) / np.isfinite(z).sum(axis=(1, 2))
+    out[share > MOST_LEFT_OUT] = False
     tracks = track(np.where(out, np.nan, z))
     going = np.arange(len(z))
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
         now = out[going]
         beyond = _beyond(model, z[going], take(tracks, going), now, most_within(gate))
+        if number >= _BOTH_WAYS:
+            beyond |= now
         changed = (beyond != now).any(axis=(1, 2))
         tracks.calls[going] += Taylor().calls(model.n) * model.evaluations
         going = going[changed]

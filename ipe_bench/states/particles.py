@@ -12,6 +12,7 @@ from ipe_bench.basics.options import Count, Quantile
 from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import factor, root, transposed
 from ipe_bench.states.base import StateModel
+from ipe_bench.states.student import as_normal, evidence, mixture, tail
 from ipe_bench.states.trackers import Tracker, Tracks, residuals, squares
 
 
@@ -100,9 +101,15 @@ def weighed(
         out.gated[:, k] = beyond
         z = np.where(beyond, np.nan, z)
         r = np.where(beyond[:, None], 0.0, r)
-    square, size = squares(r, z, R)
     y, L = _innovation(model, z, r, R, before)
     out.note_innovation(k, y, L, z)
+    if model.degrees_of_freedom:
+        density, e = _by_tails(model, z, r, R, before)
+        square, size = -2 * density, np.zeros(len(z))
+        out.nis[:, k] = np.nansum(e**2, axis=1)
+        out.innovations[:, k] = e
+    else:
+        square, size = squares(r, z, R)
     # A likelihood of exp(-800) is 0 in floating point: all are divided by the largest.
     least = square.min(axis=1, keepdims=True)
     w = before * np.exp(-0.5 * (square - least))
@@ -121,10 +128,36 @@ def _tails(r: Array, R: Array, before: Array | float) -> Array:
     for residuals r (trials, N, m)."""
     from scipy.special import ndtr
 
-    below = ndtr(r / np.sqrt(np.diagonal(R, axis1=-2, axis2=-1)))
+    below = ndtr(r / np.sqrt(_variances(R)))
     p = _shares(before, r)
     low = np.sum(p * below, axis=1)
     return 2 * np.minimum(low, np.sum(p * (1 - below), axis=1))
+
+
+def _by_tails(
+    model: StateModel, z: Array, r: Array, R: Array, before: Array | float
+) -> tuple[Array, Array]:
+    """Computes the logarithms (trials, N) of the density of readings z (trials, m), by residuals r
+    (trials, N, m), and normal numbers (trials, m) that are as probable as each given those in front
+    of it, by the weights before; NaN of missing ones."""
+    density = np.zeros(r.shape[:2])
+    e = np.full(z.shape, np.nan)
+    for j, degrees in enumerate(model.degrees_of_freedom):
+        one = mixture(degrees)
+        own = np.broadcast_to(_variances(R), r.shape)[..., j]
+        given = one.least * own, own, one
+        p = before * np.exp(density - density.max(axis=1, keepdims=True))
+        p = p / p.sum(axis=1, keepdims=True)
+        below, above = (np.sum(p * tail(y, *given), axis=1) for y in (r[..., j], -r[..., j]))
+        seen = np.isfinite(z[:, j])
+        score = as_normal(np.minimum(below, above), below - above)
+        e[:, j] = np.where(seen, score, np.nan)
+        density += np.where(seen[:, None], evidence(r[..., j], *given).density, 0.0)
+    return density, e
+
+
+def _variances(R: Array) -> Array:
+    return np.diagonal(R, axis1=-2, axis2=-1)
 
 
 def _shares(before: Array | float, r: Array) -> Array:

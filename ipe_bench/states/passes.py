@@ -38,14 +38,17 @@ from ipe_bench.states.steps import (
     Vector,
     beside,
     dot,
+    least_noise,
     near,
     predicted,
     scores,
     unit,
     updated,
+    updated_by_parts,
     within,
     zeros,
 )
+from ipe_bench.states.student import Mixture
 
 _MOST_OPERATIONS = 20_000
 """Operations of f and h in a step at most: they take two to four seconds to compile, once per
@@ -69,6 +72,8 @@ class Kind(NamedTuple):
     """Whether f and h are linearised about the states of a path."""
     gate: float | None = None
     """The squared normalised innovation of a reading beyond which it counts as missing."""
+    tails: tuple[Mixture, ...] = ()
+    """The noise of each reading; empty: all are normal."""
 
 
 class Route(NamedTuple):
@@ -87,6 +92,7 @@ class Sizes:
     n: int
     m: int
     smooths: bool
+    tails: bool = False
 
     @cached_property
     def carried(self) -> Layout:
@@ -111,6 +117,8 @@ class Sizes:
         if not self.smooths:
             parts = {name: parts[name] for name in ("x", "F", "e")}
         rest = {"predicted": self.m, "deviation": self.m, "covariance": full(n, n)}
+        if self.tails:
+            rest |= {"apart": self.m, "others": self.m, "own": self.m}
         return Layout(**parts, nis=1, **rest)
 
     @cached_property
@@ -229,17 +237,38 @@ class _Form:
                 state = State(near(state.x, here, self.state_periods), state.F)
         h = _Recorded(self.h, d, self.periods)
         linear = law(h, state, State(here, root_here) if here and root_here else state)
+        tails = self.kind.tails
+        own = [dot(row, row) for row in R]
+        if tails:
+            R = least_noise(R, tails)
         M = law.noise(R, linear)
         if self.kind.gate is not None:
             z = within(z, linear, M, self.periods, self.kind.gate)
-        found = updated(state, linear, M, z, self.periods, smooths)
+        given = z, self.periods, smooths, own, tails
+        found = _updated(state, linear, M, *given)
         for _ in range(1, self.kind.iterations):
             linear = law(h, state, found.state)
-            found = updated(state, linear, law.noise(R, linear), z, self.periods, smooths)
+            found = _updated(state, linear, law.noise(R, linear), *given)
         if here and isinstance(law, Regression):
             # Slopes by points about a path that is nearly known may be round-off themselves.
             found = found._replace(doubt=0.0)
         return {**_shown(z, found, **carried), **_told_of_move(moved, len(x))}
+
+
+def _updated(
+    state: State,
+    linear: Linear,
+    M: Rows,
+    z: Vector,
+    periods: Sequence[float],
+    smooths: bool,
+    own: Vector,
+    tails: Sequence[Mixture],
+) -> Update:
+    """Takes in readings with noise of the root M, or where that has tails with at least so much."""
+    if tails:
+        return updated_by_parts(state, linear, M, own, tails, z, periods, smooths)
+    return updated(state, linear, M, z, periods, smooths)
 
 
 def _places(some: Array) -> Shape:
@@ -280,20 +309,22 @@ def _read(
     M: Rows,
     H: Rows,
     smooths: bool,
+    own: Vector | None = None,
     gate: float | None = None,
+    tails: Sequence[Mixture] = (),
     **carried: Vector,
 ) -> dict[str, Any]:
     """Takes in readings whose linear form is given."""
     linear = Linear(y, HF, [], H)
     if gate is not None:
         z = within(z, linear, M, (), gate)
-    found = updated(State(x, F), linear, M, z, (), smooths)
+    found = _updated(State(x, F), linear, M, z, (), smooths, own or [], tails)
     return {**_shown(z, found, **carried), **_told_of_move(None, len(x))}
 
 
 def _shown(z: Vector, found: Update, log_likelihood: Vector, doubt: Vector) -> dict[str, Any]:
     """Names what an update carries on and shows."""
-    state, e, L, in_doubt, read = found
+    state, e, L, in_doubt, read, judged = found
     nis, told = scores(e, L)
     return {
         **state._asdict(),
@@ -305,6 +336,7 @@ def _shown(z: Vector, found: Update, log_likelihood: Vector, doubt: Vector) -> d
         "predicted": [a - dot(row, e) for a, row in zip(z, L, strict=True)],
         "deviation": [np.sqrt(dot(row, row)) for row in L],
         "covariance": gram(state.F),
+        **judged,
     }
 
 
@@ -335,7 +367,7 @@ class Passes(ABC):
         self.model = model
         self.functions = model.epoch_functions
         self.kind = kind
-        self.sizes = Sizes(model.n, model.readings_per_epoch, kind.smooths)
+        self.sizes = Sizes(model.n, model.readings_per_epoch, kind.smooths, bool(kind.tails))
         m, P = model.prior
         self.start = m, roots(P[None])[0]
 
@@ -475,10 +507,14 @@ class _ByEpoch(Passes):
             shown = self.sizes.moved if smooths else _NOTHING
         else:
             each = {"z": m, "y": m, "HF": full(m, n), "M": full(m, columns), "H": full(m, n)}
+            if self.kind.tails:
+                each["own"] = m
             shown = self.sizes.shown
         options: dict[str, Any] = {"smooths": smooths}
         if gate is not None:
             options["gate"] = gate
+        if self.kind.tails and text is _read:
+            options["tails"] = self.kind.tails
         recorded = partial(text, **options)
         what = text.__name__, options
         arrays = [Layout(**{name: shape}) for name, shape in each.items()]
@@ -540,14 +576,19 @@ class _ByEpoch(Passes):
                 R = rule.mean(partial(model.R_at, k=k), at.x, at.F)
             else:
                 R = model.R(k)[None]
-            M = law.noise_root(factor(R))
+            root = factor(R)
+            after = []
+            if self.kind.tails:
+                root = root * np.sqrt([one.least for one in self.kind.tails])[:, None]
+                after = [np.broadcast_to(np.diagonal(R, axis1=1, axis2=2), z.shape)]
+            M = law.noise_root(root)
             y, HF = _at(law, state, at)
             y = model.nearest(y, np.where(np.isfinite(z), z, y))
             # Slopes by points about a path that is nearly known may be round-off themselves.
             untold = self.kind.about and isinstance(rule, SigmaPoints)
             H = np.zeros(HF.shape) if untold else law.slopes(at.F)
             carry[:] = begun
-            shown[:] = self._run(_read, M, carry, [z, y, HF], [H], gate)
+            shown[:] = self._run(_read, M, carry, [z, y, HF], [H, *after], gate)
             at = self._carried(carry)
             if gate is not None:
                 # What the first linearisation takes for missing is missing to all.

@@ -55,6 +55,7 @@ class Smoother(Tracker):
         out, tracks = smoothed(model, z, behind.rule, behind.iterations, gate=behind.gate)
         out.cost = tracks.nis.sum(axis=1)  # that of its path is chi-square at the minimum alone
         out.gated = tracks.gated
+        out.weights = tracks.weights
         return out
 
 
@@ -148,13 +149,14 @@ class IteratedSmoother(Tracker):
             end = density.settled_exactly(end)
             x = end.x
             calls = calls + end.calls
-        P = density.spread(tangents).covariance
+        P = density.spread(tangents, end).covariance
         P[density.beyond_digits(tangents, x)] = np.nan
         out = Tracks.empty(model, len(x))
         out.start = Normal(x[:, 0], P[:, 0])
         out.mean = x[:, 1:]
         out.covariance = P[:, 1:]
-        out.cost = end.cost
+        out.cost = end.misfit
+        out.weights = density.weights(end)
         out.calls = calls
         return out
 
@@ -185,7 +187,7 @@ class IteratedSmoother(Tracker):
         path.calls = calls
         if not (model.gain_by_state or model.R_by_state):
             end = PathDensity.of(model, z).settled(whole(path).mean)
-            path.cost = end.cost
+            path.cost = end.misfit
             path.calls = calls + end.calls
         return path
 

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 
 from ipe_bench.engine.scan import dot, orthogonalised, product
+from ipe_bench.states.student import Mixture, evidence
 
 _SMALL = 1e-14
 """Part of a row's length, or of a pivot's row, that is round-off."""
@@ -234,6 +235,10 @@ class Update(NamedTuple):
     told: Rows
     """For a smoother rows (X, Y): the old unit noise is X e, and Y times the new one. Other noise
     is left of it in columns that the root of the states has not."""
+    judged: dict[str, Vector]
+    """Of readings with tails (m,), which have no L: those `predicted`, the standard `deviation` of
+    each innovation, given the readings in front of it the innovation `apart` and `others`, its
+    variance with the least noise, and `own`, that of the reading."""
 
 
 def within(z: Vector, linear: Linear, M: Rows, periods: Sequence[float], most: float) -> Vector:
@@ -248,21 +253,47 @@ def within(z: Vector, linear: Linear, M: Rows, periods: Sequence[float], most: f
     return kept
 
 
+class _Given(NamedTuple):
+    """Holds what readings say before they are taken in."""
+
+    seen: Vector
+    y: Vector
+    """Innovations, 0 of missing readings."""
+    W: Rows
+    """Rows of their noise and of the states' unit noise, 0 of missing readings, above those of the
+    states, and for a smoother of the unit noise itself."""
+    doubt: Number
+
+    @classmethod
+    def of(
+        cls,
+        state: State,
+        linear: Linear,
+        M: Rows,
+        z: Vector,
+        periods: Sequence[float],
+        smooths: bool,
+    ) -> _Given:
+        n = len(state.x)
+        columns = len(M[0])
+        seen = [np.less_equal(a, a) for a in z]
+        y = near(linear.y, z, periods)
+        y = [np.where(there, a - b, 0.0) for there, a, b in zip(seen, z, y, strict=True)]
+        read = []
+        for there, row in zip(seen, beside(M, linear.AF), strict=True):
+            read.append([np.where(there, a, 0.0) for a in row])
+        W = read + beside(zeros(n, columns), state.F)
+        W += beside(zeros(n, columns), unit(n)) if smooths else []
+        return cls(seen, y, W, _doubt(state, linear.A, [row[:columns] for row in read]))
+
+
 def updated(
     state: State, linear: Linear, M: Rows, z: Vector, periods: Sequence[float], smooths: bool
 ) -> Update:
     """Takes in readings z, NaN where missing, with noise of the root M."""
     m = len(z)
     n = len(state.x)
-    seen = [np.less_equal(a, a) for a in z]
-    y = near(linear.y, z, periods)
-    y = [np.where(there, a - b, 0.0) for there, a, b in zip(seen, z, y, strict=True)]
-    read = []
-    for there, row in zip(seen, beside(M, linear.AF), strict=True):
-        read.append([np.where(there, a, 0.0) for a in row])
-    columns = len(M[0])
-    W = read + beside(zeros(n, columns), state.F)
-    W += beside(zeros(n, columns), unit(n)) if smooths else []
+    seen, y, W, doubt = _Given.of(state, linear, M, z, periods, smooths)
     both = lower(W, m + n)
     L = [row[:m] for row in both[:m]]
     e: Vector = []
@@ -272,8 +303,61 @@ def updated(
     after = both[m : m + n]
     x = plus(state.x, [row[:m] for row in after], e)
     F = [row[m : m + n] for row in after]
-    doubt = _doubt(state, linear.A, [row[:columns] for row in read])
-    return Update(State(x, F), e, L, doubt, [row[: m + n] for row in both[m + n :]])
+    return Update(State(x, F), e, L, doubt, [row[: m + n] for row in both[m + n :]], {})
+
+
+def least_noise(R: Rows, tails: Sequence[Mixture]) -> Rows:
+    """Returns a root of the least noise of readings whose noise has the root R."""
+    pairs = zip(R, tails, strict=True)
+    return [[np.sqrt(one.least) * a for a in row] for row, one in pairs]
+
+
+def updated_by_parts(
+    state: State,
+    linear: Linear,
+    M: Rows,
+    own: Vector,
+    tails: Sequence[Mixture],
+    z: Vector,
+    periods: Sequence[float],
+    smooths: bool,
+) -> Update:
+    """Takes in readings z, NaN where missing, one after another, whose noise of the variances `own`
+    is a mixture each; M is a root of the least noise. The states after it have the mean and the
+    covariance of all normal distributions that they are by now."""
+    m = len(z)
+    n = len(state.x)
+    seen, y, rows, doubt = _Given.of(state, linear, M, z, periods, smooths)
+    predicted = [a - b for a, b in zip(z, y, strict=True)]
+    deviation = []
+    for R, part, row in zip(own, tails, rows, strict=False):
+        deviation.append(np.sqrt(dot(row, row, (1 - part.least) * R)))
+    e: Vector = []
+    others: Vector = []
+    # How each row moves with the innovations so far.
+    X: Rows = [[] for _ in rows]
+    for j in range(m):
+        first, *rows = rows
+        v = np.where(seen[j], dot(first, first), 1.0)
+        one = evidence(y[j], v, own[j], tails[j])
+        by_e = np.sqrt(one.gain)
+        e.append(y[j] * by_e)
+        others.append(v)
+        left = np.sqrt(one.left)
+        for i, row in enumerate(rows):
+            share = dot(row, first)
+            kept = [a - share * one.gain * b for a, b in zip(row, first, strict=True)]
+            rows[i] = [*kept, share * left]
+            X[j + 1 + i].append(share * by_e)
+        for i in range(j + 1, m):
+            y[i] = y[i] - X[i][j] * e[j]
+    both = lower(rows)
+    x = plus(state.x, X[m : m + n], e)
+    F = [row[:n] for row in both[:n]]
+    judged = {"predicted": predicted, "deviation": deviation}
+    judged |= {"apart": y, "others": others, "own": own}
+    back = beside(X[m + n :], [row[:n] for row in both[n:]]) if smooths else []
+    return Update(State(x, F), e, unit(m), doubt, back, judged)
 
 
 def _doubt(state: State, H: Rows, M: Rows) -> Number:

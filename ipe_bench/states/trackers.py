@@ -22,10 +22,12 @@ from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.options import Component, Count, Quantile
 from ipe_bench.states.algebra import factor, lower_solve, transposed
 from ipe_bench.states.base import Normal, StateModel
+from ipe_bench.states.layouts import Layout
 from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
 from ipe_bench.states.passes import Kind, Passed, Passes, Route, passes
 from ipe_bench.states.redone import believed
 from ipe_bench.states.steps import BEYOND
+from ipe_bench.states.student import Mixture, evidence, mixture, scores
 
 
 @dataclass
@@ -76,6 +78,9 @@ class Tracks:
     """The probability (trials,) of the second path beside the first, 0 where none was found."""
     gated: Mask | None = None
     """Readings (trials, K, m) that lie beyond the gate, and count as missing."""
+    weights: Array | None = None
+    """By how much readings (trials, K, m) with tails count, in parts of those that lie where they
+    are expected; NaN of missing ones."""
     by_epoch: Mask | None = None
     """Trials (trials,) that were tracked again by the model's own functions, from which recorded
     ones differ there."""
@@ -275,7 +280,7 @@ def filtered(
     """Runs the filter of the model that a rule linearises about the filter's own states, or about
     those of a path; `start` replaces the prior, and readings beyond the quantile `gate` are
     missing."""
-    kind = Kind(rule, iterations, about=path is not None, gate=gate and most_within(gate))
+    kind = _kind(model, rule, iterations, False, path, gate)
     return _passed(model, z, kind, path, start)[0]
 
 
@@ -308,15 +313,21 @@ def passed(
     gate: float | None = None,
 ) -> tuple[Tracks, Tracks]:
     """Does the same, for paths that are a beginning: those that have no digits are there, too."""
-    kind = Kind(
-        rule,
-        iterations,
-        smooths=True,
-        about=path is not None,
-        gate=gate and most_within(gate),
-    )
+    kind = _kind(model, rule, iterations, True, path, gate)
     tracks, smooth = _passed(model, z, kind, path, start)
     return smooth, tracks
+
+
+def _kind(
+    model: StateModel,
+    rule: Rule,
+    iterations: int,
+    smooths: bool,
+    path: Tracks | None,
+    gate: float | None,
+) -> Kind:
+    tails = tuple(mixture(degrees) for degrees in model.degrees_of_freedom)
+    return Kind(rule, iterations, smooths, path is not None, gate and most_within(gate), tails)
 
 
 def most_within(gate: float) -> float:
@@ -391,6 +402,8 @@ def _found(there: Passes, found: Passed, z: Array, start: Normal) -> tuple[Track
         root=layout.part(found.shown, "F"),
         gated=None if there.kind.gate is None else gated,
     )
+    if there.kind.tails:
+        _judge(tracks, layout, after, there.kind.tails)
     tracks.lose(lost)
     if found.back is None:
         return tracks, tracks
@@ -403,6 +416,29 @@ def _found(there: Passes, found: Passed, z: Array, start: Normal) -> tuple[Track
     smooth.covariance = covariance[:, 1:]
     smooth.root = of_states.part(found.back, "F")
     return tracks, smooth
+
+
+def _judge(tracks: Tracks, layout: Layout, after: Array, tails: Sequence[Mixture]) -> None:
+    """Judges innovations by mixtures: notes the normal numbers that are as probable, the likelihood
+    of the readings, and their weights."""
+    apart, others, own = (layout.part(after, name) for name in ("apart", "others", "own"))
+    seen = np.isfinite(tracks.innovations)
+    weights = np.full(seen.shape, np.nan)
+    likelihood = 0.0 * tracks.log_likelihood
+    for j, one in enumerate(tails):
+        given = apart[..., j], others[..., j], own[..., j]
+        here = seen[..., j]
+        found = evidence(*given, one)
+        likelihood += np.where(here, found.density, 0.0).sum(axis=1)
+        tracks.innovations[..., j] = np.where(here, scores(*given, one), np.nan)
+        # The noise of a normal reading that would count as much, and that where it is expected.
+        states = others[..., j] - one.least * own[..., j]
+        expected = evidence(0.0 * apart[..., j], *given[1:], one)
+        share = (1 / expected.gain - states) / (1 / found.gain - states)
+        weights[..., j] = np.where(here, share, np.nan)
+    tracks.nis = np.nansum(tracks.innovations**2, axis=2)
+    tracks.log_likelihood = likelihood
+    tracks.weights = weights
 
 
 def misfit(model: StateModel, z: Array, x: Array, k: int) -> tuple[Array, Array]:

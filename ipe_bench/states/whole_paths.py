@@ -21,6 +21,7 @@ from ipe_bench.states.algebra import (
 )
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.steps import BEYOND
+from ipe_bench.states.student import Tails
 
 _REACHED = 1e-9
 """Part of a state by which a path may miss the range of its noise or of the prior: round-off of a
@@ -41,9 +42,12 @@ class Settled:
     gap: Array
     """x[k] - f(x[k-1]) (trials, K, n)."""
     residual: Array
-    """R^-1/2 (z - h) (trials, K, m); 0 of missing readings."""
+    """R^-1/2 (z - h) (trials, K, m), in scales of readings with tails; 0 of missing readings."""
     cost: Array
     """-2 log p(path | readings) (trials,) up to a constant; infinite where that is not finite."""
+    misfit: Array
+    """The same, where readings with tails count in parts of the mean cost of one: chi-square with a
+    degree for each reading, as about, at the path of largest density."""
     calls: Array
     """Evaluations of f and of h (trials,) that this took."""
 
@@ -62,8 +66,10 @@ class PathDensity:
         dx_k - A_k dx_{k-1} - Q_k l_k &= -d_k \\
         (H_k^T R_k^{-1} H_k + D_k) dx_k + l_k - A_{k+1}^T l_{k+1} &= H_k^T R_k^{-1} r_k
 
-    where D damps it. Neither P0 nor Q is inverted, so that singular ones are no special case.
-    Without a transition into the first epoch, the states of both are the same: A = I and Q = 0.
+    where D damps it. A reading with tails counts in a step by the weight that its residual has,
+    and in the covariance by the curvature of its own density. Neither P0 nor Q is inverted, so that
+    singular ones are no special case. Without a transition into the first epoch, the states of both
+    are the same: A = I and Q = 0.
     """
 
     model: StateModel
@@ -79,7 +85,10 @@ class PathDensity:
     start: Half
     """Of P0 (n, n)."""
     whitener: Array
-    """R^-1/2 (trials, K, m, m), of missing readings that of unit variance."""
+    """R^-1/2 (trials, K, m, m), of missing readings that of unit variance, in scales of those with
+    tails."""
+    tails: Tails | None = None
+    """The noise of the readings, unless all are normal."""
 
     @classmethod
     def of(cls, model: StateModel, z: Array) -> PathDensity:
@@ -101,9 +110,12 @@ class PathDensity:
         R = np.stack([model.R(k) for k in epochs])
         L = factor(np.where(both, R, one))
         whitener = lower_solve(L, np.broadcast_to(one, L.shape))
+        tails = Tails.of(model.degrees_of_freedom)
+        if tails is not None:
+            whitener = whitener / np.sqrt(tails.scale)[:, None]
         noise = Noise(triangular(model.prior.covariance[None])[0], gains)
         start = half(model.prior.covariance)
-        return cls(model, z, gains, inverses, short, noise, start, whitener)
+        return cls(model, z, gains, inverses, short, noise, start, whitener, tails)
 
     def subset(self, rows: NDArray[np.intp]) -> PathDensity:
         """Returns the density of the trials `rows`."""
@@ -191,8 +203,12 @@ class PathDensity:
         begun = mahalanobis(x[:, 0] - m, P, self.start)
         w = products(self.inverses, gap)
         v = products(self.whitener, r)
-        cost = begun + _squared(w) + _squared(v)
-        return Settled(x, gap, v, np.nan_to_num(cost, nan=np.inf), calls)
+        by_states = begun + _squared(w)
+        costs = (v**2, v**2)
+        if self.tails is not None:
+            costs = (self.tails.costs(v), self.tails.alike(v))
+        cost, misfit = (np.nan_to_num(by_states + _total(one), nan=np.inf) for one in costs)
+        return Settled(x, gap, v, cost, misfit, calls)
 
     def _begun(self, start: Array) -> Array:
         """Returns the starts (trials, n), without the round-off by which they miss the range of the
@@ -244,11 +260,27 @@ class PathDensity:
         has none; with D = diag(damping (trials, 1 + K, n))."""
         # The right sides: m0 - x0, then -d_k, and H' R^-1 r = B' v.
         a = np.concatenate([self.model.prior.mean - at.x[:, :1], -at.gap], axis=1)
-        return self.noise.states(tangents, a, at.residual, damping)
+        residual = at.residual
+        if self.tails is not None:
+            # The slope of the costs is that of a weighted sum of squares.
+            size = np.sqrt(self.tails.weights(residual))
+            residual = size * residual
+            tangents = replace(tangents, B=size[..., None] * tangents.B)
+        return self.noise.states(tangents, a, residual, damping)
 
-    def spread(self, tangents: Tangents) -> Given:
-        """Computes what all readings say of the states of the affine model."""
+    def spread(self, tangents: Tangents, at: Settled) -> Given:
+        """Computes what all readings say of the states of the affine model about settled paths."""
+        if self.tails is not None:
+            size = np.sqrt(self.tails.curvatures(at.residual))
+            tangents = replace(tangents, B=size[..., None] * tangents.B)
         return self.noise.spread(tangents)
+
+    def weights(self, at: Settled) -> Array | None:
+        """Returns by how much readings (trials, K, m) count, as `Tracks` has it."""
+        if self.tails is None:
+            return None
+        share = self.tails.weights(at.residual) / self.tails.weights(0.0 * at.residual)
+        return np.where(np.isfinite(self.z), share, np.nan)
 
     def beyond_digits(self, tangents: Tangents, x: Array) -> Mask:
         """Tells about which paths x (trials, 1 + K, n) readings are so precise that no digits are
@@ -273,4 +305,8 @@ class PathDensity:
 
 def _squared(a: Array) -> Array:
     """Computes |a|^2 (trials,) of vectors at all epochs (trials, K, n)."""
-    return np.sum(a**2, axis=(1, 2))
+    return _total(a**2)
+
+
+def _total(a: Array) -> Array:
+    return np.sum(a, axis=(1, 2))

@@ -50,8 +50,8 @@ class Conditional(NamedTuple):
     (trials,)."""
 
     @classmethod
-    def of(cls, density: PathDensity, tangents: Tangents, g: Array) -> Conditional:
-        P, crossed, size = density.spread(tangents)
+    def of(cls, density: PathDensity, at: Settled, tangents: Tangents, g: Array) -> Conditional:
+        P, crossed, size = density.spread(tangents, at)
         c = np.matmul(crossed, g[:, None, :, None])[..., 0]
         variance = np.sum(g * c[:, -1], axis=1)
         line = c / variance[:, None, None]
@@ -133,7 +133,7 @@ class _Looked(NamedTuple):
 
 def _looked_at(density: PathDensity, at: Settled, tangents: Tangents) -> _Looked:
     trials, epochs, n = at.x.shape
-    P, crossed, size = density.spread(tangents)
+    P, crossed, size = density.spread(tangents, at)
     lines, axes = _lines(P[:, -1], crossed)
     sides = np.stack([lines, -lines], axis=1).reshape(-1, epochs, n)
     owner = np.repeat(np.arange(trials), 2 * n)
@@ -173,7 +173,7 @@ def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -
     """Computes the second moments about paths and their mass by the points of an axis on which g'
     x_K (trials, n) of the last states has unit variance."""
     trials = len(at.x)
-    middle = Conditional.of(density, tangents, g)
+    middle = Conditional.of(density, at, tangents, g)
     of_tangents = Taylor().calls(density.model.n) * density.model.evaluations
     # Each side by itself: which of them comes first is the sign of an axis, which is round-off.
     owner = np.tile(np.arange(trials), 2)
@@ -190,7 +190,7 @@ def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -
         some = density.subset(own)
         begun = some.settled(x + sign[rows, None, None] * _STRIDE * line)
         about = some.tangents(begun)
-        here = Conditional.of(some, about, g[own])
+        here = Conditional.of(some, begun, about, g[own])
         # The rest of the path follows by a step of the affine model, g' x_K by none.
         step = some.step(about, begun)
         last = begun.x[:, -1] + step[:, -1] - at.x[own, -1]

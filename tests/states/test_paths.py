@@ -100,7 +100,8 @@ def test_levenberg_and_marquardt_find_the_minimum_that_halved_steps_find():
     other = IteratedSmoother(ukf(), Taylor(), 50, damped=True, tolerance=1e-10).track(NEAR, z)
     np.testing.assert_allclose(found.mean, other.mean, atol=1e-7)
     density = PathDensity.of(NEAR, z)
-    P = density.spread(density.tangents(density.settled(whole(found)[0])))[0][:, 1:]
+    at = density.settled(whole(found)[0])
+    P = density.spread(density.tangents(at), at)[0][:, 1:]
     np.testing.assert_allclose(P, other.covariance, rtol=1e-5)
     np.testing.assert_allclose(
         found.cost, path_cost(NEAR, z, other.start.mean, other.mean), rtol=1e-9

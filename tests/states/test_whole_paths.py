@@ -89,7 +89,7 @@ def test_a_step_from_anywhere_ends_at_the_smoothed_path_of_a_linear_model(number
     found = density.settled(at.x + density.step(tangents, at))
     assert_agrees(found.x, mean, rtol=1e-9, atol=1e-9)
     assert_agrees(found.cost, tracks.cost, rtol=1e-9, atol=1e-12)
-    assert_agrees(density.spread(tangents)[0], P, rtol=1e-9, atol=1e-12)
+    assert_agrees(density.spread(tangents, at)[0], P, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(("spread", "deviation"), [(1e3, 1e-3), (1e6, 1e-2), (1e7, 1.0)])
@@ -116,8 +116,9 @@ def test_covariances_with_the_last_states_keep_their_digits_beside_a_wide_prior(
     model = widened(Drawn(number, moved_first=number % 2 == 0), 1e5)
     z = model.draw(0, 1).z
     density = PathDensity.of(model, z)
-    tangents = density.tangents(density.settled(np.zeros((1, 9, model.n))))
-    P, crossed, _ = density.spread(tangents)
+    at = density.settled(np.zeros((1, 9, model.n)))
+    tangents = density.tangents(at)
+    P, crossed, _ = density.spread(tangents, at)
     q = model.n
     roots = np.zeros((9, model.n, q))
     roots[0] = density.noise.start
@@ -182,7 +183,8 @@ def test_a_covariance_holds_where_the_valley_of_the_cost_bends():
     w = np.exp(-(x**2 + y**2 + ((y + x**2 / 16) / 0.1) ** 2) / 2)
     exact = np.sum(w * y**2) / np.sum(w)
     density = PathDensity.of(model, z)
-    narrow = density.spread(density.tangents(density.settled(whole(found)[0]))).covariance
+    at = density.settled(whole(found)[0])
+    narrow = density.spread(density.tangents(at), at).covariance
     assert narrow[0, 0, 1, 1] < 0.6 * exact
     assert exact < found.covariance[0, 0, 1, 1] < 1.3 * exact
 

@@ -11,6 +11,7 @@ from scipy.special import chdtri
 
 from ipe_bench.basics.linalg import Array, deviations, nearest
 from ipe_bench.measurements.base import with_unit
+from ipe_bench.real.logs import distrusted
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import looks_of
@@ -185,17 +186,21 @@ def _draw_bands(
 def _mark_left_out(
     ax: Axes, log: Log, places: Sequence[int], one: LogTracks, readings: Array
 ) -> None:
-    """Marks the readings (K, kinds) of these places beyond a tracker's gate, at the panel's edge
-    where they lie outside."""
-    if one.gated is None:
+    """Marks the readings (K, kinds) of these places beyond a tracker's gate, or that hardly count,
+    at the panel's edge where they lie outside."""
+    label = f"left out by {one.label}"
+    marked = one.gated
+    if marked is None:
+        label = f"hardly counted by {one.label}"
+        marked = distrusted(one.weights)
+    if marked is None:
         return
     low, high = ax.get_ylim()
     margin = 0.04 * (high - low)
     style: Any = {"linestyle": "none", "marker": "x", "color": _RED, "markersize": 5.0}
     for j, values in zip(places, readings.T, strict=True):
-        out = one.gated[:, j]
+        out = marked[:, j]
         if out.any():
-            label = f"left out by {one.label}"
             shown = np.clip(values[out], low + margin, high - margin)
             ax.plot(log.model.times[out], shown, label=label, **style)
 

@@ -52,6 +52,11 @@ _OF_GATES = (
     "A reading whose own innovation, or distance from the path of all others (lm_ieks, auto), lies"
     " beyond the gate counts as missing; NIS is divided by its mean within the gate."
 )
+_OF_TAILS = (
+    "Innovations by Student's t are the normal numbers that are as probable. The filter's"
+    " likelihood and covariance hold for normal predicted states; a path's cost is about"
+    " chi-square. Weights are in parts of that of a reading as predicted."
+)
 _OF_CONSTANTS = (
     f"Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
     " the innovations, so only whiteness tests the model. Intervals of uncertain deviations are"
@@ -120,6 +125,8 @@ class LogAnswer(Labelled[LogTracks]):
             columns[f"{name}_predicted_deviation"] = one.predicted_deviation[:, j]
             if one.gated is not None:
                 columns[f"{name}_left_out"] = one.gated[:, j]
+            if one.weights is not None:
+                columns[f"{name}_weight"] = one.weights[:, j]
         columns["nis"] = one.nis
         return pd.DataFrame(columns)
 
@@ -156,6 +163,8 @@ class LogAnswer(Labelled[LogTracks]):
             notes.append(Legend(_OF_PARTICLES))
         if any(one.gated is not None for one in found):
             notes.append(Legend(_OF_GATES))
+        if any(one.weights is not None for one in found):
+            notes.append(Legend(_OF_TAILS))
         if any(one.constants for one in found):
             notes.append(Legend(_OF_CONSTANTS))
         title = f"{self.log.model.name}: is the filter right?"

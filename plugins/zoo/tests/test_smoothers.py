@@ -112,7 +112,8 @@ def test_covariances_of_the_oscillators_paths_are_never_below_those_of_tangents(
     with np.errstate(all="ignore"):
         tracks = LevenbergMarquardtSmoother().track(oscillator, z)
     path = np.concatenate([tracks.start.mean[:, None], tracks.mean], axis=1)
-    P = density.spread(density.tangents(density.settled(path))).covariance
+    at = density.settled(path)
+    P = density.spread(density.tangents(at), at).covariance
     root = np.linalg.inv(np.linalg.cholesky(P[:, -1]))
     relative = root @ tracks.covariance[:, -1] @ root.transpose(0, 2, 1)
     assert (np.linalg.eigvalsh(relative) > 0.75).all()
