@@ -9,6 +9,7 @@ import os
 import sys
 import typing
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -255,9 +256,26 @@ class Function(WrittenModel):
 
     @cached_property
     def _known(self) -> dict[str, Any]:
-        """The arguments that are not parameters: columns as arrays (m,), and constants."""
-        columns = {name: read_only(self.column(name)) for name in self.headings}
-        return {**columns, **self.constants}
+        """The arguments that are not parameters: columns as arrays, and constants."""
+        columns = {name: self.column(name) for name in self.headings}
+        if self.outputs:
+            _, rows = np.unique(self._places, return_index=True)
+            columns = {name: column[rows] for name, column in columns.items()}
+        return {**{name: read_only(column) for name, column in columns.items()}, **self.constants}
+
+    @cached_property
+    def _places(self) -> NDArray[np.intp]:
+        """The row (m,) of each reading among those that h is told: outputs of the same columns
+        share one, since h may add rows up, or take them in ascending order only."""
+        columns = [self.column(name).tolist() for name in self.headings]
+        before: Counter[tuple[Any, ...]] = Counter()
+        rows: dict[tuple[Any, ...], int] = {}
+        places = []
+        for output, *values in zip(self.output, *columns, strict=True):
+            again = before[output, *values]
+            before[output, *values] += 1
+            places.append(rows.setdefault((again, *values), len(rows)))
+        return np.array(places)
 
     def _at(self, values: Any) -> Any:
         """Computes h at these values (n,) of the parameters, in their own units; at their real
@@ -288,9 +306,12 @@ class Function(WrittenModel):
             )
         of_jax = type(found[0]).__module__.startswith("jax")
         where = sys.modules["jax"].numpy.where if of_jax else np.where
-        z = self._checked(found[0], self.m)
-        for name, values in zip(self.outputs[1:], found[1:], strict=True):
-            z = where(np.array(self.output) == name, self._checked(values, self.m), z)
+        places = self._places
+        rows = int(places.max()) + 1
+        first, *others = (self._checked(values, rows)[places] for values in found)
+        z = first
+        for name, values in zip(self.outputs[1:], others, strict=True):
+            z = where(np.array(self.output) == name, values, z)
         return z
 
     def _checked(self, z: Any, m: int | None) -> Any:

@@ -2,6 +2,7 @@
 with mistakes."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -499,6 +500,19 @@ def test_readings_of_a_tuple_stand_row_by_row(laws, of):
     )
     slopes = [[[-0.5 * np.exp(-1.5)], [0.5], [-2 * np.exp(-6)], [2.0]]]
     np.testing.assert_allclose(law.jacobian(np.array([[3.0]])), slopes, rtol=1e-9)
+
+
+def test_a_function_of_a_tuple_is_told_each_row_once(laws):
+    (laws / "summed.py").write_text(
+        "import numpy as np\ndef h(t, k=2.0):\n    return k * np.cumsum(t), k * t\n"
+    )
+    table = laws / "summed.csv"
+    table.write_text("t,total,each\n1,2,2\n2,6,4\n2,10,4\n3,16,\n")
+    law = ib.measurements.Function(of="summed:h", outputs=("total", "each"))
+    fit = ib.estimate(law, table, {"lm": ib.baselines.LevenbergMarquardt()}, examine=False)[0]
+    np.testing.assert_allclose(fit.residuals[:7], 0.0, atol=1e-12)
+    below = replace(law, columns={"t": [1, 2, 2, 1, 2]}, output=("total",) * 3 + ("each",) * 2)
+    np.testing.assert_allclose(below.simulate(below.nominal[None]), [[2, 6, 10, 2, 4]])
 
 
 @pytest.mark.parametrize(
