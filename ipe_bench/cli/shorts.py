@@ -468,15 +468,17 @@ class _Reader:
             return [name.strip() for name in typed[0].strip("[]").split(",")]
         arrays = last.value.elts
         free = [name for name in self._free(taken) if not name.startswith(f"{SIGMA}_")]
-        names = [one.id for one in arrays if isinstance(one, ast.Name)]
-        if len(names) == len(arrays) and {*names} <= {*free}:
-            unused = [name for name in free if name not in names]
+        named = [one.id if isinstance(one, ast.Name) else "" for one in arrays]
+        if {*named} <= {*free}:
+            unused = [name for name in free if name not in named]
             if unused:
-                self._refuse_unused(what, unused, [*taken, *names])
-            return names
-        if len(free) == len(arrays):
+                self._refuse_unused(what, unused, [*taken, *named])
+            return named
+        rest = (name for name in free if name not in named)
+        meant = [name if name in free else next(rest, "NAME") for name in named]
+        if len(free) == len(arrays) and meant == free:
             return free
-        example = ",".join([*free, *["NAME"] * len(arrays)][: len(arrays)])
+        example = ",".join(meant)
         raise UserError(
             f"{self.files[0]}: {what} returns {len(arrays)} arrays, and columns"
             f" {enumerate_few(free) or 'none'} are left for them; name theirs in order:"
