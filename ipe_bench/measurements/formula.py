@@ -170,7 +170,7 @@ class WrittenModel(Measurement):
     def require_columns_and_parameters(self, *keys: str, readings: Sequence[str] = ()) -> None:
         """Refuses columns of different lengths, names in the options `keys` that are no parameters,
         and angles that are none of the `readings` or have another unit."""
-        known = [*readings, self.reading]
+        known = readings or [self.reading]
         for name in self.circular:
             refuse_unknown(f"circular={name}", name, known, "reading")
             if self.unit not in ("", "rad", "deg", "°"):

@@ -224,7 +224,7 @@ def _headings(table: TextTable, wanted: Sequence[str]) -> dict[str, str]:
     for name in wanted:
         if name not in columns:
             raise table.error(f"column {name} is missing (the header must be {','.join(wanted)})")
-    if columns.get("time", "time") not in ("time", "time [s]"):
+    if unit_of(columns.get("time", "time")) not in ("", "s"):
         raise table.error(
             f"column {columns['time']}: the unit must be s, as in time [s]; convert the values"
         )

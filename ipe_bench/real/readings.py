@@ -141,9 +141,10 @@ class TextTable:
         """Finds the column of that heading; a heading without a unit is found with one, too."""
         if wanted in self.heading:
             return wanted
+        alike = [name for name in self.heading if quantity(name) == quantity(wanted)]
         if quantity(wanted) != wanted:
-            return None
-        return next((name for name in self.heading if quantity(name) == wanted), None)
+            return next((name for name in alike if unit_of(name) == unit_of(wanted)), None)
+        return next(iter(alike), None)
 
     def require_known(self, known: Collection[str], wanted: Sequence[str]) -> None:
         """Refuses columns that are not known."""
@@ -154,7 +155,9 @@ class TextTable:
             remedy = "remove it"
             if name:
                 what = f"column {name}"
-                remedy = f"remove it, or set ignore_columns=[{quantity(name)}]"
+                alike = [one for one in self.heading if quantity(one) == quantity(name)]
+                short = f"'{name}'" if alike[1:] else quantity(name)
+                remedy = f"remove it, or set ignore_columns=[{short}]"
             meant = did_you_mean(name, [one for one in wanted if one not in self.heading])
             hint = f"{meant} Otherwise" if meant else ";"
             raise self.error(
@@ -214,6 +217,13 @@ def _reduced(table: TextTable, without: Sequence[str]) -> TextTable:
     """Leaves columns out of a table."""
     if not without:
         return table
+    for name in without:
+        alike = [one for one in table.heading if quantity(one) == name]
+        if alike[1:] and name not in table.heading:
+            raise table.error(
+                f"ignore_columns={name}: columns {' and '.join(alike)} have that name; write the"
+                " unit, too"
+            )
     gone = {table.find(name.strip()) for name in without}
     kept = [k for k, name in enumerate(table.heading) if name not in gone]
     heading = [table.heading[k] for k in kept]
@@ -415,6 +425,7 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
 
 def _readings_in(table: TextTable, model: Measurement) -> Readings:
     """Reads a file, which may have too few readings."""
+    given = table
     table = _stacked(table, model)
     sigma = table.find(SIGMA)
     columns = {wanted: table.find(wanted.heading) for wanted in model.inputs}
@@ -439,13 +450,16 @@ def _readings_in(table: TextTable, model: Measurement) -> Readings:
         sampled = model.with_inputs(known, len(z))
     except UserError as error:
         raise table.error(str(error)) from None
-    _require_unit_of_angles(table, shown, sampled)
+    if len(sampled.periods):
+        _require_unit_of_angles(table, shown, sampled)
     wanted = tuple(dict.fromkeys((*known, _shown_as(model)[0], SIGMA)))
     table.require_known((*used, *sampled.index), wanted)
     for name, values in sampled.index.items():
         if name not in known and name in table.heading:
             _require_order(table, name, values)
-    return Readings(sampled, z, _sigmas(table, sigma, range(len(z)), z, shown), used)
+    own = tuple(name for name in given.heading if name not in table.heading)
+    sigmas = _sigmas(table, sigma, range(len(z)), z, shown)
+    return Readings(sampled, z, sigmas, (*used, *own))
 
 
 def _stacked(table: TextTable, model: Measurement) -> TextTable:
@@ -455,11 +469,26 @@ def _stacked(table: TextTable, model: Measurement) -> TextTable:
         found = {choice: table.find(choice) for choice in label.choices}
         columns = {choice: name for choice, name in found.items() if name is not None}
         if columns and not any(map(table.find, (label.heading, *_shown_as(model)))):
-            return _stack(table, label.heading, columns)
+            _require_units(table, columns, model)
+            return _stack(table, label.heading, columns, model.reading_unit)
     return table
 
 
-def _stack(table: TextTable, label: str, columns: Mapping[str, str]) -> TextTable:
+def _require_units(table: TextTable, columns: Mapping[str, str], model: Measurement) -> None:
+    """Refuses columns of readings in another unit than the model's: where some are angles, that is
+    theirs."""
+    angles = getattr(model, "circular", ())
+    for choice, name in columns.items():
+        if choice in angles:
+            _require_unit_of_angles(table, name, model)
+        if choice in angles or not angles:
+            wanted = model.reading_unit
+            if wanted and unit_of(name) not in ("", wanted):
+                raise table.error(f"column {name}: the unit must be {wanted}; convert the values")
+
+
+def _stack(table: TextTable, label: str, columns: Mapping[str, str], stated: str = "") -> TextTable:
+    """Stacks columns of readings, whose unit may be stated."""
     found = {choice: table.find(f"{SIGMA}_{choice}") for choice in columns}
     sigmas = {choice: name for choice, name in found.items() if name is not None}
     parts = {"reading": columns}
@@ -468,12 +497,16 @@ def _stack(table: TextTable, label: str, columns: Mapping[str, str]) -> TextTabl
     for choice in columns:
         if sigmas and choice not in sigmas:
             raise table.error(f"column {SIGMA}_{choice} is missing beside the others'")
+        if sigmas and table.find(SIGMA):
+            raise table.error(f"has columns {SIGMA} and {sigmas[choice]}; remove one of them")
+        if sigmas:
+            _require_same_unit(table, sigmas[choice], columns[choice])
     own = {name for part in parts.values() for name in part.values()}
     kept = [place for place, name in enumerate(table.heading) if name not in own]
     heading = [*(table.heading[place] for place in kept), label]
-    for part, names in parts.items():
-        units = {unit_of(name) for name in names.values()}
-        heading.append(with_unit(part, units.pop()) if len(units) == 1 else part)
+    units = {stated or unit_of(name) for name in columns.values()}
+    unit = units.pop() if len(units) == 1 else ""
+    heading += [with_unit(part, unit) for part in parts]
     rows = []
     for number, row in table.rows:
         for choice in columns:
@@ -588,7 +621,7 @@ def _require_unit_of_angles(table: TextTable, heading: str, model: Measurement) 
     """Refuses a unit of angles that the model, which takes them for radians, does not state: a
     whole turn is another number in it."""
     unit = unit_of(heading)
-    if not len(model.periods) or model.reading_unit or unit in ("", "rad"):
+    if model.reading_unit or unit in ("", "rad"):
         return
     remedy = "convert the values to rad"
     if unit in ("deg", "°"):
@@ -610,6 +643,14 @@ def _input(table: TextTable, wanted: Input, text: str, where: str) -> Any:
     return wanted.kind(value)
 
 
+def _require_same_unit(table: TextTable, column: str, shown: str) -> None:
+    """Refuses standard deviations in another unit than that of the readings."""
+    if unit_of(column) not in ("", unit_of(shown)):
+        raise table.error(
+            f"column {column}: the unit must be the unit of {shown}; convert the values"
+        )
+
+
 def _sigmas(
     table: TextTable, column: str | None, rows: Sequence[int], z: Array, shown: str
 ) -> Array | None:
@@ -617,10 +658,7 @@ def _sigmas(
     name; None without it."""
     if column is None:
         return None
-    if unit_of(column) not in ("", unit_of(shown)):
-        raise table.error(
-            f"column {column}: the unit must be the unit of {shown}; convert the values"
-        )
+    _require_same_unit(table, column, shown)
     cells = table.column(column)
     values = []
     for row, reading in zip(rows, z, strict=True):

@@ -150,6 +150,8 @@ def test_each_output_has_the_deviations_of_its_column(tmp_path):
     [
         ("time,x,y\n1,1.1,1.6\n2,1.2,one\n3,1,1.1\n", "row 3, column y: 'one' is not a number"),
         ("time,x,sigma_x,y\n1,1,1,1\n2,1,1,1\n", "column sigma_y is missing"),
+        ("time,x (m),y,sigma_x (cm),sigma_y\n1,1,1,1,1\n2,1,1,1,1\n", "the unit of x .m.; conv"),
+        ("time,x,y,sigma,sigma_x,sigma_y\n1,1,1,1,2,2\n", "has columns sigma and sigma_x; remove"),
         ("time,x,y,z\n1,1,1,1\n2,1,1,1\n", "column z is not understood"),
         ("time,output,reading,y\n1,x,1,1\n2,x,1,1\n", "column y is not understood"),
     ],
@@ -157,3 +159,39 @@ def test_each_output_has_the_deviations_of_its_column(tmp_path):
 def test_a_fault_of_such_a_table_is_told_by_its_own_columns(tmp_path, wide, said):
     with pytest.raises(UserError, match=said):
         read_as(tmp_path, wide)
+
+
+@pytest.mark.parametrize(
+    ("unit", "headings", "said"),
+    [
+        ("", "x (m),y (deg)", "column y .deg.: angles without measurement.unit are in rad; set"),
+        ("deg", "x (m),y (rad)", "column y .rad.: the unit must be deg"),
+    ],
+)
+def test_angles_beside_other_outputs_have_the_unit_that_is_stated(tmp_path, unit, headings, said):
+    angles = {"circular": ("y",), "unit": unit}
+    with pytest.raises(UserError, match=said):
+        read_as(tmp_path, f"time,{headings}\n1,1,1\n2,1,1\n", **angles)
+    found, _ = read_as(tmp_path, "time,x (m),y\n1,2,3\n2,4,5\n", **angles)
+    assert list(found.values()) == [2, 3, 4, 5]
+
+
+def test_columns_that_differ_by_their_unit_alone_are_told_apart(tmp_path):
+    line = ib.measurements.Formula("a + b*t", {"a": 1.0, "b": 1.0}, reading="y")
+    path = tmp_path / "both.csv"
+    path.write_text("t,y (m),y (ft)\n1,1,3\n2,2,7\n")
+    with pytest.raises(UserError, match=r"set ignore_columns=\['y \(ft\)'\]"):
+        open_together([path], line)
+    with pytest.raises(UserError, match=r"columns y .m. and y .ft. have that name"):
+        read_tables([path], ["y"])
+    assert open_together([path], line, without=["y (m)"]).z.tolist() == [3, 7]
+
+
+def test_files_of_several_columns_of_readings_have_the_same_units(tmp_path):
+    paths = []
+    for name, unit in (("one", "m"), ("two", "cm")):
+        paths.append(tmp_path / f"{name}.csv")
+        paths[-1].write_text(f"time,x ({unit}),y (s)\n1,1,1\n2,1,1\n")
+    model = ib.measurements.Ode(GROWTH, {"a": 0.1, "b": 0.2}, initial={"x": 1, "y": 2})
+    with pytest.raises(UserError, match=r"column x .cm.: .*one.csv has it in m; convert"):
+        open_together(paths, model)
