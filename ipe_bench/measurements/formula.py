@@ -158,8 +158,10 @@ class WrittenModel(Measurement):
     def _far_columns(self) -> str:
         """Says which columns are far from 0 beside their spread, and what to subtract from each."""
         found = []
-        for name in self.headings:
-            column = self.column(name)
+        for name, values in self.input_columns.items():
+            column = np.asarray(values)
+            if column.dtype.kind not in "if":  # names of outputs
+                continue
             spread = np.ptp(column)
             if 0.0 < _FAR * spread < np.abs(column).min():
                 unit = 10.0 ** np.ceil(np.log10(spread))
