@@ -55,7 +55,7 @@ _OF_GATES = (
 _OF_TAILS = (
     "Innovations by Student's t are the normal numbers that are as probable. The filter's"
     " likelihood and covariance hold for normal predicted states; a path's cost is about"
-    " chi-square. Weights are in parts of that of a reading as predicted."
+    " chi-square. A reading has weight 1 where it is predicted."
 )
 _OF_CONSTANTS = (
     f"Constants have the largest likelihood that {SEARCHES} searches found. They were fitted to"
