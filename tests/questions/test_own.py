@@ -152,6 +152,7 @@ def test_the_cheapest_of_those_that_do_as_well_is_taken_and_the_others_costs_are
     claims = [
         claim("auto", 200, cost=24.0),
         claim("newton", 200, cost=5.0),
+        claim("as dear", 200, cost=5.0),
         claim("lm", 199, cost=10.0),
         claim("ekf", 100, cost=1.0),
     ]

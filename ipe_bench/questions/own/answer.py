@@ -29,6 +29,8 @@ chance explains it: of one estimate, this verdict is true of fresh data sets in 
 cases."""
 _TOO_LARGE = 0.75
 """Share of their width that would do, below which they are said to be too large."""
+_DEARER = 1.05
+"""Factor of the cost from which on an estimator is said to cost more."""
 _FAR = 100.0
 """Factor from which on error bars are wrong by far."""
 
@@ -177,7 +179,8 @@ def _dearer(own: Own, point: Point) -> Iterator[str]:
         return
     equal = [one for one in _equal(own, point) if _bars(one) == _bars(best) and one is not best]
     equal.sort(key=lambda one: one.cost)
-    costs = [f"{one.label} {one.cost / max(best.cost, 1.0):.2g} times" for one in equal]
+    factors = [(one.label, one.cost / max(best.cost, 1.0)) for one in equal]
+    costs = [f"{label} {factor:.2g} times" for label, factor in factors if factor >= _DEARER]
     if costs:
         yield (
             f"Those that do as well from this start cost more than {best.label}:"
