@@ -416,7 +416,8 @@ def function(
 def title_of(model: Measurement) -> str:
     """Names a model in titles: a function by its own name, a short formula by itself."""
     whole = model
-    while isinstance(whole, Forwarding):
+    # Differential equations are written, too: what they wrap needs the times of readings.
+    while isinstance(whole, Forwarding) and not isinstance(whole, WrittenModel):
         whole = whole.whole
     if isinstance(whole, Function):
         return whole.of.rpartition(":")[2]

@@ -320,6 +320,7 @@ def test_noise_that_is_overstated_is_said_and_rounded_intervals_hold_the_estimat
         (["oxygen.py", "oxygen.csv"], "demand", "estimate-demand"),
         (["b1*(1-exp(-b2*t))", "oxygen.csv"], "b1*(1-exp(-b2*t))", "estimate-formula"),
         (["car.yaml", "log.csv"], "car", "estimate-car"),
+        (["decay.yaml", "pair.csv"], "decay", "estimate-decay"),
     ],
 )
 def test_an_answer_has_the_name_that_its_user_gave_to_the_model(
@@ -332,6 +333,8 @@ def test_an_answer_has_the_name_that_its_user_gave_to_the_model(
     (tmp_path / "oxygen.csv").write_text("\n".join(["t,reading", *rows]))
     yaml = "next: {x: x + w}\nreadings: {gps: x}\nnoise: {w: 0.1}\ndeviation: {gps: 1}\n"
     (tmp_path / "car.yaml").write_text(f"{yaml}spread: {{x: 1}}\n")
+    (tmp_path / "decay.yaml").write_text("rates: {x: -k*x}\nstart: {k: 1}\ninitial: {x: 1}\n")
+    (tmp_path / "pair.csv").write_text("time,reading\n1,0.4\n2,0.2\n")
     (tmp_path / "log.csv").write_text("gps\n" + "\n".join(map(str, [0.3, -0.2, 1.1, 0.4])) + "\n")
     monkeypatch.chdir(tmp_path)
     asked = single("estimate", shorts.read("estimate", words).in_full)
