@@ -213,10 +213,7 @@ def _refuse_no_model(file: str, words: Sequence[str]) -> None:
             )
         reading = _reading_named(word)
         if reading:
-            raise UserError(
-                f"{word}: {file} has no column {reading}; its columns are"
-                f" {', '.join(_columns(file))}: name one of them before the ="
-            )
+            _refuse_absent(word, file, reading)
     flags = [word for word in words if word.startswith("-")]
     bare = [word for word in words if "=" not in word and not word.startswith("~")]
     if bare and not flags:
@@ -226,6 +223,15 @@ def _refuse_no_model(file: str, words: Sequence[str]) -> None:
             if one.stem == bare[0] and one.suffix in (".py", *_YAML):
                 remedy = f"did you mean {one.name}?"
         raise UserError(f"{bare[0]}: {what}; {remedy}")
+
+
+def _refuse_absent(formula: str, file: str, reading: str) -> NoReturn:
+    """Refuses a formula of readings that are no column."""
+    sign = formula.partition(reading)[2].strip()[0]
+    raise UserError(
+        f"{formula}: {file} has no column {reading}; its columns are"
+        f" {', '.join(_columns(file))}: name one of them before the {sign}"
+    )
 
 
 def _shown(model: str) -> str:
@@ -535,6 +541,7 @@ class _Reader:
         usual = ("y", "reading")
         if named:
             usual = (named["reading"],)
+            self._refuse_other_reading(named["reading"], names)
         what = f"the formula of {', '.join(names)}"
         self._refuse_bare(names)
         if not columns and len(self._free([])) > 1:
@@ -554,6 +561,23 @@ class _Reader:
         model = f"Model: {formula}{start}; {remedy}."
         told = [model, self._told(columns, reading), self._noise()]
         return self._short(words, told, self._remarks(columns, reading))
+
+    def _refuse_other_reading(self, reading: str, names: Sequence[str]) -> None:
+        """Refuses a formula whose readings are no column, or one that is used otherwise."""
+        if reading not in self.columns:
+            _refuse_absent(self.model, self.files[0], reading)
+        (typed,) = self._typed("measurement.reading") or [reading]
+        use = ""
+        if reading in names:
+            use = "is part of the formula, too; use it on one side alone"
+        elif reading == SIGMA:
+            use = "has the standard deviations of the readings; name another column"
+        elif reading in self._ignored:
+            use = "is left out by ignore_columns; name another column, or keep this one"
+        elif listed(typed) != [reading]:
+            use = f"has the readings, and so has measurement.reading={typed}; give one of them"
+        if use:
+            raise UserError(f"{self.model}: the column {reading} {use}")
 
     def _refuse_without_column(self, names: Sequence[str], usual: Sequence[str]) -> NoReturn:
         """Refuses a formula of names that are no columns; one may be short for a column."""

@@ -148,8 +148,9 @@ Begun = list[tuple[Sequence[int], Sequence[Expression]]]
 
 def _begin(tape: Recording, begun: Begun) -> tuple[Program, tuple[int, ...]]:
     """Makes the program `begin`, and lists the places of its results."""
-    places = tuple(i for at, _ in begun for i in at)
-    started = [e for _, filling in begun for e in filling]
+    pairs = [pair for at, filling in begun for pair in zip(at, filling, strict=True)]
+    places = tuple(i for i, _ in pairs)
+    started = [e for _, e in pairs]
     return Program.of(started, [*tape.p, *tape.c]), places
 
 

@@ -89,8 +89,9 @@ class Attempts(ABC):
         """Minimises from x (candidates, n), on all data unless another objective is given, charged
         to the trials `owner` (candidates,)."""
         objective = self.whole(owner) if objective is None else objective
-        tolerance = tolerance or self.limits.tolerance
-        limits = replace(self.limits, max_iterations=steps, tolerance=tolerance)
+        limits = replace(self.limits, max_iterations=steps)
+        if tolerance is not None:
+            limits = replace(limits, tolerance=tolerance)
         minima = minimize(objective, method, x, limits)
         self.charge(owner, objective.model.tally)
         return minima
@@ -110,6 +111,8 @@ class Attempts(ABC):
         """Adds to each trial what its candidates have cost since they were `counted`."""
         for name in ("simulations", "jacobians", "reported"):
             total = getattr(self.tally, name)
-            np.add.at(total, owner, getattr(tally, name) - total[owner])
+            spent = getattr(tally, name) - total[owner]
+            assert (spent >= 0).all()
+            np.add.at(total, owner, spent)
         for candidate, message in tally.messages.items():
             self.tally.messages.setdefault(int(owner[candidate]), message)

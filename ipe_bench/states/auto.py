@@ -159,7 +159,9 @@ class AutoTracker(Tracker):
             return tracks
         other, second = smoothed(model, z[doubtful], Unscented())
         tracks.calls[doubtful] += second.calls
-        likelier = ~(second.log_likelihood <= first.log_likelihood[doubtful])
+        before = first.log_likelihood[doubtful]
+        # A filter that breaks down, as at points that have no noise level, is not likelier.
+        likelier = np.isnan(before) | (second.log_likelihood > before)
         rows = doubtful[likelier]
         stage[rows] = UNSCENTED
         cost[rows] = second.nis.sum(axis=1)[likelier]

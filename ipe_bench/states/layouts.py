@@ -62,6 +62,7 @@ class Layout:
         found = []
         for name, shape in self.shapes.items():
             if isinstance(shape, int):
+                assert len(parts[name]) == shape, name
                 found += parts[name]
                 continue
             for row, places in zip(parts[name], shape, strict=True):
@@ -99,6 +100,7 @@ def named_step(
         parts = {}
         for number, layout in enumerate((carried, *each, shared)):
             unknowns = graph.inputs(f"{number} ", layout.size)
+            assert parts.keys().isdisjoint(layout.shapes)
             parts |= layout.parts(unknowns)
             inputs += unknowns
         found = text(**parts)

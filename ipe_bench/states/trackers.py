@@ -386,8 +386,9 @@ def _found(there: Passes, found: Passed, z: Array, start: Normal) -> tuple[Track
     # A reading beyond the gate is missing, and has no innovation.
     gated = given & np.isnan(predicted) & np.isfinite(layout.part(after, "nis"))
     seen = given & ~gated
-    log_likelihood, doubt = found.carried[:, -2:].T.copy()
-    lost = doubt > BEYOND
+    carried = there.sizes.carried
+    log_likelihood = carried.part(found.carried, "log_likelihood")[:, 0].copy()
+    lost = carried.part(found.carried, "doubt")[:, 0] > BEYOND
     tracks = Tracks(
         mean=layout.part(after, "x"),
         covariance=layout.part(after, "covariance", n, n),

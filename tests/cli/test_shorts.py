@@ -430,3 +430,25 @@ def test_a_mistake_is_told_with_what_to_write(
     code, _, error = ipe_bench("estimate", *words)
     assert code == 2
     assert said in error
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["y ~ a*t+b", "warm.csv"], "name one of them before the ~"),
+        (["y=a*t+b", "warm.csv"], "name one of them before the ="),
+        (["y ~ a*t+b", "volt.csv"], "has no column y; its columns are t, volt"),
+        (["y=a*t+b", "volt.csv"], "has no column y; its columns are t, volt"),
+        (["t ~ a*t+b", "volt.csv"], "the column t is part of the formula"),
+        (["t=a*t+b", "volt.csv"], "the column t is part of the formula"),
+        (["volt ~ a*t+b", "volt.csv", "measurement.reading=t"], "measurement.reading=t"),
+        (["volt ~ a*t+b", "volt.csv", "ignore_columns=volt"], "is left out by ignore_columns"),
+        (["sigma ~ a*time+b", "weighed.csv"], "has the standard deviations"),
+    ],
+)
+def test_no_other_column_is_read_than_the_one_that_a_formula_names(
+    words: list[str], said: str
+) -> None:
+    with pytest.raises(UserError) as caught:
+        shorts.read("estimate", words)
+    assert said in str(caught.value)

@@ -481,3 +481,21 @@ def test_a_transition_that_jumps_by_a_turn_is_told_to_state_its_period():
         .hindrance(replace(VOLATILITY, state_period={"logvar": 1.0}))
         .startswith("has no place for a periodic state")
     )
+
+
+def test_a_finite_answer_is_kept_where_points_have_no_noise_level() -> None:
+    """The root of a negative number is none: the points of a wide prior lie on both sides of 0."""
+    model = Formulas(
+        next={"x": "x"},
+        readings={"y": "x"},
+        noise={},
+        deviation={"y": "0.05*sqrt(x)"},
+        start={"x": 1.0},
+        spread={"x": 1.5},
+        count=6,
+    )
+    z = 3.0 + np.arange(6.0)[None, :, None]
+    tangents = Smoother(Filter(Taylor())).track(model, z)
+    assert np.isnan(ukf().track(model, z).mean).all()
+    np.testing.assert_array_equal(TRACKERS["auto"].track(model, z).mean, tangents.mean)
+    assert np.isfinite(tangents.mean).all()
