@@ -30,7 +30,8 @@ from ipe_bench.real.readings import SIGMA, quantity, read_headings, read_tables
 from ipe_bench.report.words import enumerate_few
 
 _DATA = (".csv", ".tsv", ".txt", ".dat", ".parquet")
-_NUMERIC = re.compile(r"\s*[-+]?[.,]?\d")
+_NUMERIC = re.compile(r"[\W_]*\d")
+"""The beginning of a number, perhaps behind a sign: <2, $2."""
 _SHEETS = (".xlsx", ".xls", ".ods", ".numbers")
 _YAML = (".yaml", ".yml")
 _FUNCTION = re.compile(r"(?P<file>.+\.py)(:(?P<name>\w*))?")
@@ -329,7 +330,7 @@ class _Reader:
     @cached_property
     def texts(self) -> list[str]:
         """Columns of the first file whose cells are texts that begin with no number, such as
-        remarks: 20 °C may be a reading."""
+        remarks: 20 °C and <2 may be readings."""
         (table,) = read_tables([Path(self.files[0])])
         found = []
         for heading in table.heading:

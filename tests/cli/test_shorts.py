@@ -364,12 +364,13 @@ def test_texts_beside_the_readings_are_left_out_and_said(
     assert question.found.z.tolist() == [98.8, 95.1]
 
 
+@pytest.mark.parametrize("cells", [("20 °C", "21 °C"), ("<2", "<3"), ("$20", "$21")])
 def test_a_column_whose_texts_begin_with_numbers_is_not_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cells: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It may be the readings, with a unit in each cell, or their dates."""
+    """It may be the readings, with a unit or a sign in each cell, or their dates."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "own.csv").write_text("t,temperature,volt\n1,20 °C,3.4\n2,21 °C,5.2\n")
+    (tmp_path / "own.csv").write_text("t,temperature,volt\n1,{},3.4\n2,{},5.2\n".format(*cells))
     with pytest.raises(UserError, match="columns temperature, volt are not in the formula"):
         shorts.read("estimate", ["a*t", "own.csv"])
 
