@@ -38,10 +38,10 @@ class AutoTracker(Tracker):
     1. The extended filter and its smoother. 2. Where its innovations are improbable, the unscented
     ones, if their path costs less. 3. Levenberg-Marquardt steps from there. A path that the first
     of them would hardly move, such as that of a linear model, is the answer of the stage that it
-    comes from. 4. Where the path at the end is improbable, rounds of steps from draws of the prior,
-    other ones in each. 5. Steps from the start mirrored in the prior's mean, if the model is not
-    affine: of the two paths the more probable one is the answer, and the other one stands beside
-    it; see `with_second`.
+    comes from. 4. Where the path at the end is improbable, or may lie at a saddle, as where a
+    square is read at 0, rounds of steps from draws of the prior, other ones in each. 5. Steps from
+    the start mirrored in the prior's mean, if the model is not affine: of the two paths the more
+    probable one is the answer, and the other one stands beside it; see `with_second`.
 
     Noise that depends on the states leaves no density to descend on: the more likely smoother of
     the two is the answer. A scalar state with process noise whose reading turns back among the
@@ -127,7 +127,7 @@ class AutoTracker(Tracker):
         paths = self.descent.descended(density, paths)
         arrived = (paths.status == Status.CONVERGED) & (paths.iterations == 1)
         stage[~arrived] = DAMPED
-        paths, by = self.descent.restarted(density, paths)
+        paths, by = self.descent.restarted(density, paths, tracks.start)
         stage = np.where(by > 0, AGAIN + by - 1, stage)
         # The path of an affine model has no second one beside it.
         rows = np.flatnonzero(stage >= DAMPED)

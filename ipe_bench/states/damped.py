@@ -19,6 +19,7 @@ from ipe_bench.states.algebra import root
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.left_out import leaving_out
 from ipe_bench.states.linearisation import Taylor, Unscented
+from ipe_bench.states.saddles import at_saddles
 from ipe_bench.states.smoothers import path_p, whole
 from ipe_bench.states.trackers import Tracker, Tracks, passed
 from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
@@ -103,10 +104,10 @@ class LevenbergMarquardtSmoother(Tracker):
 
     The first path is the smoothed track of the EKF or of the UKF, whichever costs less. At its
     minimum J is chi-square with as many degrees as there are readings. Where it is too large for
-    that, the trial begins again at draws of the prior, each smoothed by a UKF of half or a tenth of
-    the prior's deviations, from the one that costs least, in up to twelve rounds of draws. The
-    covariance is that of the affine model, or where the density is not normal a second moment about
-    the path; see `widened`.
+    that, or the path may lie at a saddle, the trial begins again at draws of the prior, each
+    smoothed by a UKF of half or a tenth of the prior's deviations, from the one that costs least,
+    in up to twelve rounds of draws. The covariance is that of the affine model, or where the
+    density is not normal a second moment about the path; see `widened`.
 
     Example:
 
@@ -142,19 +143,26 @@ class LevenbergMarquardtSmoother(Tracker):
         if self.gate is not None:
             return leaving_out(partial(replace(self, gate=None).track, model), model, z, self.gate)
         density = PathDensity.of(model, z)
-        first, other = (
-            Descent.of(density, passed(model, z, rule)[0]) for rule in (Taylor(), Unscented())
-        )
+        tracks = passed(model, z, Taylor())[0]
+        first = Descent.of(density, tracks)
+        other = Descent.of(density, passed(model, z, Unscented())[0])
         paths = self.descended(density, first.improved(other, np.arange(len(z))))
-        return reported(density, self.restarted(density, paths)[0])[0]
+        return reported(density, self.restarted(density, paths, tracks.start)[0])[0]
 
-    def restarted(self, density: PathDensity, paths: Descent) -> tuple[Descent, NDArray[np.int64]]:
-        """Begins improbable paths again in rounds of draws, until they are probable or were found
-        three times more, and tells which round each path is of (trials,), 0 for one of none."""
+    def restarted(
+        self, density: PathDensity, paths: Descent, start: Normal
+    ) -> tuple[Descent, NDArray[np.int64]]:
+        """Begins improbable paths again in rounds of draws, and those that may lie at a saddle, by
+        the start that tangents find. Ends where they are probable or were found three times more,
+        and tells which round each path is of (trials,), 0 for one of none."""
         by = np.zeros(len(density.z), np.int64)
         again = np.zeros(len(density.z), np.int64)
-        rows = np.flatnonzero(self.improbable(density.z, paths.at.misfit))
-        for number in range(self.rounds if self.starts else 0):
+        if not self.starts:
+            return paths, by
+        at_saddle, calls = at_saddles(density, paths.at, start)
+        paths = replace(paths, calls=paths.calls + calls)
+        rows = np.flatnonzero(self.improbable(density.z, paths.at.misfit) | at_saddle)
+        for number in range(self.rounds):
             if not rows.size:
                 break
             some = density.subset(rows)

@@ -241,3 +241,37 @@ def test_the_column_extra_stage_says_which_stage_answered():
     block = PathBlock.draw(StateScenario(ConstantVelocity(count=5)), 0, 4)
     assert (block.estimate(AutoTracker())[1]["extra_stage"] == EXTENDED).all()
     assert "extra_stage" not in block.estimate(ekf())[1]
+
+
+WALKS = Formulas(
+    next={"x": "x + w", "y": "y + v"},
+    readings={"z": "x**2"},
+    noise={"w": 0.1, "v": 0.1},
+    deviation={"z": 0.1},
+    spread={"x": 1.0, "y": 1.0},
+    count=20,
+)
+
+
+@pytest.mark.parametrize("reading", ["x**2", "cos(x)", "x*y", "(x - y)**2"])
+@pytest.mark.parametrize("tracker", [AutoTracker(), LevenbergMarquardtSmoother()], ids=repr)
+def test_no_path_rests_at_a_saddle(reading, tracker):
+    """Where such a reading turns back, its tangents say nothing, and the cost curves downwards."""
+    model = replace(WALKS, readings={"z": reading})
+    z = model.draw(1, 8).z
+    found = tracker.track(model, z)
+    density = PathDensity.of(model, z)
+    x = np.concatenate([found.start.mean[:, None], found.mean], axis=1)
+    cost = density.settled(x).cost
+    for way in ([1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, -1.0]):
+        aside = density.settled(x + 0.1 * np.array(way)).cost
+        back = density.settled(x - 0.1 * np.array(way)).cost
+        assert (aside + back >= 2 * cost - 0.5).all()
+
+
+def test_a_state_that_no_reading_tells_of_takes_no_further_start():
+    model = replace(WALKS, readings={"z": "x"})
+    z = model.draw(1, 4).z
+    found = AutoTracker().track(model, z)
+    np.testing.assert_array_equal(found.stage, EXTENDED)
+    np.testing.assert_allclose(found.mean, Smoother(ekf()).track(model, z).mean, atol=1e-9)
