@@ -9,7 +9,8 @@ readings say about each parameter is in `observability`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NoReturn, get_args
 
@@ -228,13 +229,20 @@ def design(
 def covariance_of(scenario: Scenario, candidates: Measurement) -> Covariance:
     """Returns R of candidates: as today's readings of these labels have it, else as new ones
     would."""
-    labels = zip(*scenario.measurement.index.values(), strict=True)
-    places = {label: place for place, label in enumerate(labels)}
-    rows = [places.get(label) for label in zip(*candidates.index.values(), strict=True)]
+    places = {label: place for place, label in enumerate(_labels(scenario.measurement))}
+    rows = [places.get(label) for label in _labels(candidates)]
     known = [row for row in rows if row is not None]
     if len(known) < len(rows):
         return scenario.noise.covariance(candidates.m)
     return scenario.problem.R.restricted(np.array(known))
+
+
+def _labels(model: Measurement) -> Iterator[tuple[Any, int]]:
+    """Yields the labels of readings, each with the number of those before that have the same."""
+    before: Counter[Any] = Counter()
+    for label in zip(*model.index.values(), strict=True):
+        yield label, before[label]
+        before[label] += 1
 
 
 def _point(model: Measurement, at: Mapping[str, float] | None) -> Array:

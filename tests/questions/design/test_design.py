@@ -29,7 +29,7 @@ from ipe_bench.questions.design.answer import (
     write_design,
 )
 from ipe_bench.questions.design.figure import draw_further
-from ipe_bench.questions.design.maths import design
+from ipe_bench.questions.design.maths import covariance_of, design
 from ipe_bench.report.style import house_style
 from ipe_bench.trials.observability import Observability, suspects
 from ipe_bench.trials.scenario import Scenario
@@ -667,3 +667,18 @@ def test_each_candidate_among_todays_readings_keeps_its_own_deviation():
     after = np.linalg.inv(A.T @ A).diagonal()
     today = np.linalg.inv((model.A.T / deviations**2) @ model.A).diagonal()
     assert best.mean_bound == pytest.approx(np.sqrt((after / today).mean()), rel=1e-12)
+
+
+class Repeated(Chosen):
+    """Two readings have the same labels."""
+
+    @property
+    def index(self):
+        return {"number": [row // 2 for row in self.rows]}
+
+
+def test_repeated_candidates_keep_their_own_deviations():
+    deviations = (0.5, 1.0, 2.0, 3.0, 4.0)
+    model = Repeated(most=5)
+    R = covariance_of(Scenario(model, Gaussian(deviations)), model)
+    assert tuple(R.deviations) == deviations
