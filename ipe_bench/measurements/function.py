@@ -304,14 +304,14 @@ class Function(WrittenModel):
                 f"measurement.of={self.of}: outputs names {len(self.outputs)} arrays; let it return"
                 " a tuple of them"
             )
-        of_jax = type(found[0]).__module__.startswith("jax")
-        where = sys.modules["jax"].numpy.where if of_jax else np.where
+        of_jax = any(type(values).__module__.startswith("jax") for values in found)
+        numpy = sys.modules["jax"].numpy if of_jax else np
         places = self._places
         rows = int(places.max()) + 1
-        first, *others = (self._checked(values, rows)[places] for values in found)
-        z = first
-        for name, values in zip(self.outputs[1:], others, strict=True):
-            z = where(np.array(self.output) == name, values, z)
+        arrays = [numpy.asarray(self._checked(values, rows))[places] for values in found]
+        z = arrays[0]
+        for name, values in zip(self.outputs, arrays, strict=True):
+            z = numpy.where(np.array(self.output) == name, values, z)
         return z
 
     def _checked(self, z: Any, m: int | None) -> Any:
