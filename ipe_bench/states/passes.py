@@ -1,8 +1,12 @@
-"""Runs the steps of filters and smoothers along a model's epochs: recorded together with f and h,
-or, where these are not recorded or too long, epoch by epoch, with their values and slopes given as
-numbers.
+"""Runs Gaussian filters and smoothers along a model's epochs.
 
-A trial that breaks down is NaN from then on and disturbs no other.
+A pass takes all trials forward through the epochs with a filter, and for a smoother back again. If
+f and h are recorded, each epoch is one program of machine code that contains them
+(`_RecordedPasses`); if not, or if that program would be long, f and h are called and linearised in
+NumPy, and machine code takes their values and slopes as numbers (`_PassesByEpoch`). A step is
+written once, as a function of lists: the parts of its *carry*, which goes from epoch to epoch, and
+of its *output*, which is stored at each, lie in rows of numbers as `StepLayouts` says. A trial that
+breaks down is NaN from then on and disturbs no other.
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -22,7 +26,7 @@ from ipe_bench.engine.rows import RowFunction
 from ipe_bench.engine.scan import Step, gram
 from ipe_bench.engine.trace import RowPrograms
 from ipe_bench.states.algebra import factor, half, triangular
-from ipe_bench.states.along import Recording
+from ipe_bench.states.along import EpochFunctions, Recording
 from ipe_bench.states.base import Kept, Normal, StateModel
 from ipe_bench.states.layouts import Layout, Shape, full, named_step, packed, triangle, unpacked
 from ipe_bench.states.linearisation import Linearised, Rule, SigmaPoints, Taylor
@@ -62,14 +66,15 @@ _LANES = 8
 
 
 class Kind(NamedTuple):
-    """Says what a pass does."""
+    """Says which filter or smoother a pass runs."""
 
     rule: Rule
     iterations: int = 1
+    """Linearisations of each reading."""
     smooths: bool = False
     """Whether a pass back follows."""
-    about: bool = False
-    """Whether f and h are linearised about the states of a path."""
+    about_path: bool = False
+    """Whether f and h are linearised about the states of a path, in place of the filter's own."""
     gate: float | None = None
     """The squared normalised innovation of a reading beyond which it counts as missing."""
     tails: tuple[Mixture, ...] = ()
@@ -86,48 +91,53 @@ class Route(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """Lays out what the steps of n states and m readings take and give."""
+class StepLayouts:
+    """Lays out the inputs and outputs of steps with n states and m readings.
+
+    States are x + F v, where the unit noise v is N(0, I). A smoother steps back by rows (X, Y),
+    which give the unit noise before a transition or update by that after it; see `steps`.
+    """
 
     n: int
     m: int
     smooths: bool
-    tails: bool = False
+    has_tails: bool = False
 
     @cached_property
-    def carried(self) -> Layout:
+    def filter_carry(self) -> Layout:
         return Layout(x=self.n, F=triangle(self.n), log_likelihood=1, doubt=1)
 
     @cached_property
-    def moved(self) -> Layout:
-        """What a transition tells a step back."""
-        return Layout(moved=full(self.n, self.n), noise=triangle(self.n))
+    def transition_rows(self) -> Layout:
+        """The rows (X, Y) of a transition."""
+        return Layout(transition_X=full(self.n, self.n), transition_Y=triangle(self.n))
 
     @cached_property
-    def told(self) -> Layout:
-        """What a step back takes of an epoch."""
+    def smoother_input(self) -> Layout:
+        """What a smoother needs of an epoch: its filtered states, innovations e, and rows."""
         n = self.n
-        read = full(n, self.m + n)
-        return Layout(x=n, F=triangle(n), e=self.m, read=read, **self.moved.shapes)
+        rows = {"update_rows": full(n, self.m + n), **self.transition_rows.shapes}
+        return Layout(x=n, F=triangle(n), e=self.m, **rows)
 
     @cached_property
-    def shown(self) -> Layout:
+    def filter_output(self) -> Layout:
+        """What a filter stores of an epoch; the input of a smoother, if one follows, in front."""
         n = self.n
-        parts = dict(self.told.shapes)
+        parts = dict(self.smoother_input.shapes)
         if not self.smooths:
             parts = {name: parts[name] for name in ("x", "F", "e")}
-        rest = {"predicted": self.m, "deviation": self.m, "covariance": full(n, n)}
-        if self.tails:
-            rest |= {"apart": self.m, "others": self.m, "own": self.m}
-        return Layout(**parts, nis=1, **rest)
+        diagnostics = {"predicted": self.m, "deviation": self.m, "covariance": full(n, n)}
+        if self.has_tails:
+            diagnostics |= {"apart": self.m, "others": self.m, "own": self.m}
+        return Layout(**parts, nis=1, **diagnostics)
 
     @cached_property
-    def unit(self) -> Layout:
-        """What a step back carries: the noise that is left of each state's unit noise."""
+    def smoother_carry(self) -> Layout:
+        """Mean u and root S of the filter's unit noise, given all readings."""
         return Layout(u=self.n, S=triangle(self.n))
 
     @cached_property
-    def back(self) -> Layout:
+    def smoother_output(self) -> Layout:
         return Layout(x=self.n, F=triangle(self.n), covariance=full(self.n, self.n))
 
 
@@ -136,8 +146,8 @@ def roots(P: Array) -> Array:
     return packed(triangular(P))
 
 
-class _Recorded(NamedTuple):
-    """Stands for f or h of an epoch as it is recorded."""
+class _RecordedFunction(NamedTuple):
+    """Stands for f or h of an epoch in a step that is recorded."""
 
     programs: RowPrograms
     c: Vector
@@ -149,9 +159,10 @@ class _Recorded(NamedTuple):
 
     def slopes(self, x: Vector) -> tuple[Vector, Rows]:
         m = self.programs.m
-        found = self.programs.values([*x, *self.c])
-        columns = [self.programs.tangents([*u, *found[m:]]) for u in unit(self.programs.n)]
-        return found[:m], [list(row) for row in zip(*columns, strict=True)]
+        # Behind the m values lie the intermediate numbers that the slopes share.
+        values = self.programs.values([*x, *self.c])
+        columns = [self.programs.tangents([*u, *values[m:]]) for u in unit(self.programs.n)]
+        return values[:m], [list(row) for row in zip(*columns, strict=True)]
 
 
 def law_of(rule: Rule, n: int) -> Law | None:
@@ -169,15 +180,21 @@ def numbers_of(rule: Rule, n: int) -> Any:
     return law if isinstance(law, Regression) else None
 
 
-_NOTHING = Layout()
+_EMPTY = Layout()
+_NO_SHARED = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
-class _Form:
-    """Describes the machine code of a step, as far as it depends on a model."""
+class _RecordedStep:
+    """Describes a step of a filter whose machine code contains f and h.
+
+    `_PassesByEpoch` repeats its iterations, gate and slopes about a path in NumPy. Tests hold the
+    two equal: tests/states/test_recorded_steps.py the iterations, test_gate.py the gate (both forms
+    beside a textbook filter), and test_student.py the tails.
+    """
 
     kind: Kind
-    sizes: Sizes
+    layouts: StepLayouts
     f: RowPrograms | None
     """None where the states stand still."""
     h: RowPrograms
@@ -186,73 +203,109 @@ class _Form:
     each: Layout
     """The numbers of a trial and epoch."""
     shared: Layout
-    """The numbers of an epoch."""
+    """The numbers of an epoch, which all trials share."""
 
     @classmethod
-    def of(cls, passes: Passes, f: RowPrograms | None, h: RowPrograms, G: Array, R: Array) -> _Form:
+    def of(cls, passes: Passes, f: RowPrograms | None, h: RowPrograms, noise: _Noise) -> Self:
         model = passes.model
         n = model.n
-        kind = passes.kind
+        m = passes.layouts.m
         path: dict[str, Shape] = {}
-        if kind.about:
-            path = {"before": n, "root": triangle(n), "here": n, "root_here": triangle(n)}
-        each = Layout(z=passes.sizes.m, **path)
-        of_f = 0 if f is None else f.values.inputs - n
-        noise: dict[str, Shape] = {"G": _places(G), "R": _places(R)}
-        shared = Layout(c=of_f, d=h.values.inputs - n, **noise)
-        periods = model.state_periods or (0.0,) * n, model.periods or (0.0,) * passes.sizes.m
-        return cls(kind, passes.sizes, f, h, *periods, each, shared)
+        if passes.kind.about_path:
+            before: dict[str, Shape] = {"x_before": n, "F_before": triangle(n)}
+            path = {**before, "x_here": n, "F_here": triangle(n)}
+        roots: dict[str, Shape] = {"G": _shape_of(noise.G_mask), "R": _shape_of(noise.R_mask)}
+        numbers_of_f = 0 if f is None else f.values.inputs - n
+        return cls(
+            kind=passes.kind,
+            layouts=passes.layouts,
+            f=f,
+            h=h,
+            state_periods=model.state_periods or (0.0,) * n,
+            periods=model.periods or (0.0,) * m,
+            each=Layout(z=m, **path),
+            shared=Layout(c=numbers_of_f, d=h.values.inputs - n, **roots),
+        )
 
-    def step(self) -> Step:
-        sizes = self.sizes
+    def compiled(self) -> Step:
+        layouts = self.layouts
         # A rule of a plugin may get other points by the same name: the numbers tell.
-        what = (self, numbers_of(self.kind.rule, sizes.n))
-        return named_step(self.text, what, sizes.carried, [self.each], self.shared, sizes.shown)
+        identity = (self, numbers_of(self.kind.rule, layouts.n))
+        carry, output = layouts.filter_carry, layouts.filter_output
+        return named_step(self.step, identity, carry, [self.each], self.shared, output)
 
-    def text(
+    def step(
         self,
         x: Vector,
         F: Rows,
+        log_likelihood: Vector,
+        doubt: Vector,
         z: Vector,
         c: Vector,
         d: Vector,
         G: Rows,
         R: Rows,
-        before: Vector | None = None,
-        root: Rows | None = None,
-        here: Vector | None = None,
-        root_here: Rows | None = None,
-        **carried: Vector,
+        **path: Any,
     ) -> dict[str, Any]:
-        law = law_of(self.kind.rule, len(x))
-        assert law is not None
+        """Predicts the states of an epoch and takes in its readings."""
         state = State(x, F)
-        moved = None
-        smooths = self.kind.smooths
+        path_before = path_here = None
+        if self.kind.about_path:
+            path_before = State(path["x_before"], path["F_before"])
+            path_here = State(path["x_here"], path["F_here"])
+        rows = None
         if self.f is not None:
-            f = _Recorded(self.f, c, self.state_periods)
-            linear = law(f, state, State(before, root) if before and root else state)
-            state, moved = predicted(linear, law.noise(G, linear), smooths)
-            if here:
-                state = State(near(state.x, here, self.state_periods), state.F)
-        h = _Recorded(self.h, d, self.periods)
-        linear = law(h, state, State(here, root_here) if here and root_here else state)
+            f = _RecordedFunction(self.f, c, self.state_periods)
+            state, rows = self._predict(f, state, G, path_before)
+            if path_here is not None:
+                # Angles may have gone around since the path's state, about which h is linearised.
+                state = State(near(state.x, path_here.x, self.state_periods), state.F)
+        h = _RecordedFunction(self.h, d, self.periods)
+        z, update = self._update(h, state, z, R, path_here)
+        output = _filter_output(z, update, log_likelihood, doubt)
+        return {**output, **_named_rows(rows, len(x))}
+
+    @property
+    def _law(self) -> Law:
+        law = law_of(self.kind.rule, self.layouts.n)
+        assert law is not None
+        return law
+
+    def _predict(
+        self, f: _RecordedFunction, state: State, G: Rows, at: State | None
+    ) -> tuple[State, Rows]:
+        law = self._law
+        linear = law(f, state, state if at is None else at)
+        return predicted(linear, law.noise(G, linear), self.kind.smooths)
+
+    def _update(
+        self, h: _RecordedFunction, state: State, z: Vector, R: Rows, at: State | None
+    ) -> tuple[Vector, Update]:
+        """Returns the readings within the gate, and the update by them."""
+        law = self._law
+        linear = law(h, state, state if at is None else at)
+        variances = [dot(row, row) for row in R]
         tails = self.kind.tails
-        own = [dot(row, row) for row in R]
         if tails:
             R = least_noise(R, tails)
         M = law.noise(R, linear)
         if self.kind.gate is not None:
+            # What the first linearisation takes for missing is missing to all.
             z = within(z, linear, M, self.periods, self.kind.gate)
-        given = z, self.periods, smooths, own, tails
-        found = _updated(state, linear, M, *given)
+        given = z, self.periods, self.kind.smooths, variances, tails
+        update = _updated(state, linear, M, *given)
         for _ in range(1, self.kind.iterations):
-            linear = law(h, state, found.state)
-            found = _updated(state, linear, law.noise(R, linear), *given)
-        if here and isinstance(law, Regression):
+            linear = law(h, state, update.state)
+            update = _updated(state, linear, law.noise(R, linear), *given)
+        if at is not None and isinstance(law, Regression):
             # Slopes by points about a path that is nearly known may be round-off themselves.
-            found = found._replace(doubt=0.0)
-        return {**_shown(z, found, **carried), **_told_of_move(moved, len(x))}
+            update = update._replace(doubt=0.0)
+        return z, update
+
+
+def _shape_of(mask: Array) -> Shape:
+    """Returns the shape of a matrix of which only the numbers of a mask are kept."""
+    return tuple(map(tuple, mask.tolist()))
 
 
 def _updated(
@@ -262,104 +315,105 @@ def _updated(
     z: Vector,
     periods: Sequence[float],
     smooths: bool,
-    own: Vector,
+    variances: Vector,
     tails: Sequence[Mixture],
 ) -> Update:
     """Takes in readings with noise of the root M, or where that has tails with at least so much."""
     if tails:
-        return updated_by_parts(state, linear, M, own, tails, z, periods, smooths)
+        return updated_by_parts(state, linear, M, variances, tails, z, periods, smooths)
     return updated(state, linear, M, z, periods, smooths)
 
 
-def _places(some: Array) -> Shape:
-    return tuple(map(tuple, some.tolist()))
+def _predict_step(
+    x: Vector, F: Rows, y: Vector, AF: Rows, N: Rows, smooths: bool, **scores: Vector
+) -> dict[str, Any]:
+    """Predicts by y = A x + b and A F, which are given as numbers, and noise of the root N."""
+    state, rows = predicted(Linear(y, AF, [], []), N, smooths)
+    return {**scores, **state._asdict(), **_named_rows(rows, len(x))}
 
 
-def _back(
-    u: Vector,
-    S: Rows,
+def _update_step(
     x: Vector,
     F: Rows,
-    e: Vector,
-    read: Rows,
-    moved: Rows,
-    noise: Rows,
-) -> dict[str, Any]:
-    """Steps back from an epoch to the one before."""
-    after = Smoothed(u, S)
-    state = after.of(State(x, F))
-    before = after.before(e, read, beside(moved, noise))
-    return {**before._asdict(), **state._asdict(), "covariance": gram(state.F)}
-
-
-def _move(
-    x: Vector, F: Rows, y: Vector, AF: Rows, N: Rows, smooths: bool, **carried: Vector
-) -> dict[str, Any]:
-    """Steps along a transition whose linear form is given."""
-    state, moved = predicted(Linear(y, AF, [], []), N, smooths)
-    return {**carried, **state._asdict(), **_told_of_move(moved, len(x))}
-
-
-def _read(
-    x: Vector,
-    F: Rows,
+    log_likelihood: Vector,
+    doubt: Vector,
     z: Vector,
     y: Vector,
     HF: Rows,
     M: Rows,
     H: Rows,
     smooths: bool,
-    own: Vector | None = None,
+    variances: Vector | None = None,
     gate: float | None = None,
     tails: Sequence[Mixture] = (),
-    **carried: Vector,
 ) -> dict[str, Any]:
-    """Takes in readings whose linear form is given."""
+    """Takes in readings by y = H x + b and H F, which are given as numbers, and noise of the root
+    M."""
     linear = Linear(y, HF, [], H)
     if gate is not None:
         z = within(z, linear, M, (), gate)
-    found = _updated(State(x, F), linear, M, z, (), smooths, own or [], tails)
-    return {**_shown(z, found, **carried), **_told_of_move(None, len(x))}
+    update = _updated(State(x, F), linear, M, z, (), smooths, variances or [], tails)
+    return {**_filter_output(z, update, log_likelihood, doubt), **_named_rows(None, len(x))}
 
 
-def _shown(z: Vector, found: Update, log_likelihood: Vector, doubt: Vector) -> dict[str, Any]:
-    """Names what an update carries on and shows."""
-    state, e, L, in_doubt, read, judged = found
-    nis, told = scores(e, L)
+def _smoother_step(
+    u: Vector,
+    S: Rows,
+    x: Vector,
+    F: Rows,
+    e: Vector,
+    update_rows: Rows,
+    transition_X: Rows,
+    transition_Y: Rows,
+) -> dict[str, Any]:
+    """Smooths the states of an epoch, and steps back to the one before."""
+    after = Smoothed(u, S)
+    state = after.of(State(x, F))
+    before = after.before(e, update_rows, beside(transition_X, transition_Y))
+    return {**before._asdict(), **state._asdict(), "covariance": gram(state.F)}
+
+
+def _filter_output(
+    z: Vector, update: Update, log_likelihood: Vector, doubt: Vector
+) -> dict[str, Any]:
+    """Names what a filter carries on from an update and stores of it."""
+    state, e, L, doubt_here, update_rows, judged = update
+    nis, log_density = scores(e, L)
     return {
         **state._asdict(),
-        "log_likelihood": [log_likelihood[0] + told],
-        "doubt": [np.maximum(doubt[0], in_doubt)],
+        "log_likelihood": [log_likelihood[0] + log_density],
+        "doubt": [np.maximum(doubt[0], doubt_here)],
         "e": e,
-        "read": read,
+        "update_rows": update_rows,
         "nis": [nis],
         "predicted": [a - dot(row, e) for a, row in zip(z, L, strict=True)],
         "deviation": [np.sqrt(dot(row, row)) for row in L],
         "covariance": gram(state.F),
+        # Readings with tails have no L: these replace what is predicted by it.
         **judged,
     }
 
 
-def _told_of_move(moved: Rows | None, n: int) -> dict[str, Rows]:
-    """Names what a transition tells a smoother; without one the noise stays what it was."""
-    if moved is None:
-        moved = beside(unit(n), zeros(n, n))
-    return {"moved": [row[:n] for row in moved], "noise": [row[n:] for row in moved]}
+def _named_rows(rows: Rows | None, n: int) -> dict[str, Rows]:
+    """Names the rows (X, Y) of a transition; without one the unit noise stays what it was."""
+    if rows is None:
+        rows = beside(unit(n), zeros(n, n))
+    return {"transition_X": [row[:n] for row in rows], "transition_Y": [row[n:] for row in rows]}
 
 
 class Passed(NamedTuple):
-    """Holds what passes along the epochs of some trials found."""
+    """Holds what the passes of some trials found, in rows of `StepLayouts`."""
 
-    shown: Array
-    """(trials, 1 + K, s), the prior in front."""
-    carried: Array
-    """(trials, c) of the last epoch."""
-    back: Array | None
-    """(trials, 1 + K, b)"""
+    filtered: Array
+    """Outputs of the filter (trials, 1 + K, o), the prior in front."""
+    carry: Array
+    """That of the filter after the last epoch (trials, c)."""
+    smoothed: Array | None
+    """Outputs of the smoother (trials, 1 + K, b)."""
 
 
 class Passes(ABC):
-    """Passes along a model's epochs, there and back."""
+    """Passes along a model's epochs, forward and back."""
 
     numbers: ClassVar[float] = _NUMBERS
 
@@ -367,108 +421,91 @@ class Passes(ABC):
         self.model = model
         self.functions = model.epoch_functions
         self.kind = kind
-        self.sizes = Sizes(model.n, model.readings_per_epoch, kind.smooths, bool(kind.tails))
-        m, P = model.prior
-        self.start = m, roots(P[None])[0]
+        m = model.readings_per_epoch
+        self.layouts = StepLayouts(model.n, m, kind.smooths, bool(kind.tails))
+        mean, P = model.prior
+        self.prior = mean, roots(P[None])[0]
 
     @abstractmethod
-    def there(self, z: Array, route: Route | None, carry: Array, shown: Array) -> None:
+    def forward(self, z: Array, route: Route | None, carry: Array, output: Array) -> None:
         """Advances carry (trials, c) along readings z (trials, 1 + K, m), of which the first are
-        none, and fills what is shown (trials, 1 + K, s)."""
+        none, and fills the output (trials, 1 + K, o)."""
 
     @property
     def at_once(self) -> int:
         """Trials that are run together at most."""
-        each = self.sizes.shown.size
+        each = self.layouts.filter_output.size
         if self.kind.smooths:
-            each += self.sizes.back.size
+            each += self.layouts.smoother_output.size
         return max(_LANES, int(self.numbers / ((1 + self.model.epochs) * each)))
-
-    @cached_property
-    def _back(self) -> Step:
-        told = self.sizes.told
-        return named_step(_back, "back", self.sizes.unit, [told], _NOTHING, self.sizes.back)
 
     def run(self, z: Array, route: Route | None, start: Normal | None) -> Passed:
         """Passes along readings z (trials, K, m) from the prior, or from other starts."""
-        sizes = self.sizes
-        trials, K, _ = z.shape
-        mean, root = self.start if start is None else (start.mean, roots(start.covariance))
-        carry = np.zeros((trials, sizes.carried.size))
-        shown = np.empty((trials, 1 + K, sizes.shown.size))
-        shown[:, 0] = 0.0
-        for rows, layout in ((carry, sizes.carried), (shown[:, 0], sizes.shown)):
-            rows[:, layout.at["x"]] = mean
-            rows[:, layout.at["F"]] = root
-        padded = np.empty((trials, 1 + K, z.shape[2]))
+        trials, K, m = z.shape
+        carry, output = self._begun(trials, K, start)
+        padded = np.empty((trials, 1 + K, m))
         padded[:, 0] = np.nan
         padded[:, 1:] = z
-        self.there(padded, route, carry, shown)
-        if not self.kind.smooths:
-            return Passed(shown, carry, None)
+        self.forward(padded, route, carry, output)
+        return Passed(output, carry, self._back(output) if self.kind.smooths else None)
+
+    def _begun(self, trials: int, K: int, start: Normal | None) -> tuple[Array, Array]:
+        """Returns the carry and the output of a filter, filled with the states at the start."""
+        layouts = self.layouts
+        mean, root = self.prior if start is None else (start.mean, roots(start.covariance))
+        carry = np.zeros((trials, layouts.filter_carry.size))
+        output = np.empty((trials, 1 + K, layouts.filter_output.size))
+        output[:, 0] = 0.0
+        for rows, layout in ((carry, layouts.filter_carry), (output[:, 0], layouts.filter_output)):
+            rows[:, layout.at["x"]] = mean
+            rows[:, layout.at["F"]] = root
+        return carry, output
+
+    def _back(self, filtered: Array) -> Array:
+        """Smooths from the last epoch to the start, by the outputs of the filter."""
+        layouts = self.layouts
+        trials, length, _ = filtered.shape
         # After the last epoch nothing is read: u = 0 and S = I.
-        after = np.zeros((trials, sizes.unit.size))
-        after[:, sizes.unit.at["S"]] = packed(np.eye(sizes.n))
-        back = np.empty((trials, 1 + K, sizes.back.size))
-        self._back.run(after, [shown], _NONE, back, K, -1, 1 + K)
-        return Passed(shown, carry, back)
+        carry = np.zeros((trials, layouts.smoother_carry.size))
+        carry[:, layouts.smoother_carry.at["S"]] = packed(np.eye(layouts.n))
+        output = np.empty((trials, length, layouts.smoother_output.size))
+        self._step_back.run(carry, [filtered], _NO_SHARED, output, length - 1, -1, length)
+        return output
+
+    @cached_property
+    def _step_back(self) -> Step:
+        layouts = self.layouts
+        carry, output = layouts.smoother_carry, layouts.smoother_output
+        each = [layouts.smoother_input]
+        return named_step(_smoother_step, "smoother", carry, each, _EMPTY, output)
 
 
-_NONE = np.empty((0, 0))
+class _Noise(NamedTuple):
+    """Holds roots of the noise of all epochs, without the numbers that are 0 in each."""
 
+    G_mask: Array
+    """Whether a number of the gains is ever other than 0 (n, q)."""
+    R_mask: Array
+    """The same of the roots of R (m, m)."""
+    G: Array
+    """(K, numbers), 0 where the states stand still."""
+    R: Array
+    """(K, numbers)"""
 
-class _Together(Passes):
-    """Passes whose steps are recorded together with f and h."""
-
-    def __init__(self, model: StateModel, kind: Kind) -> None:
-        super().__init__(model, kind)
+    @classmethod
+    def of(cls, model: StateModel) -> Self:
         K = model.epochs
-        f, h = self.functions
         moving = np.array([k for k in range(K) if model.moves(k)], dtype=int)
         gains = model.gains(moving)
-        noise = factor(model.covariances(np.arange(K)))
-        G = (gains != 0).any(axis=0)
-        R = (noise != 0).any(axis=0)
-        gain_numbers = np.zeros((K, int(G.sum())))
-        gain_numbers[moving] = gains[:, G]
-        of_f, at_f = f.places(K)
-        of_h, at_h = h.places(K)
-        pairs = of_f * len(h.recordings) + of_h
-        made: dict[int, tuple[Step, Array]] = {}
-        for pair in np.unique(pairs).tolist():
-            here = np.flatnonzero(pairs == pair)
-            first = int(here[0])
-            moved = f.recordings[int(of_f[first])] if model.moves(first) else None
-            read = h.recordings[int(of_h[first])]
-            programs = None if moved is None else _programs(moved)
-            form = _Form.of(self, programs, _programs(read), G, R)
-            shared = np.zeros((1 + K, form.shared.size))
-            values = {"d": read.numbers[at_h[here]], "R": noise[here][:, R]}
-            if moved is not None:
-                values |= {"c": moved.numbers[at_f[here]], "G": gain_numbers[here]}
-            for name, numbers in values.items():
-                shared[1 + here, form.shared.at[name]] = numbers
-            made[pair] = form.step(), shared
-        changes = np.flatnonzero(np.diff(pairs)) + 1
-        self.runs: list[_Run] = []
-        for first, end in pairwise([0, *changes.tolist(), K]):
-            self.runs.append(_Run(*made[int(pairs[first])], 1 + first, end - first))
-
-    def there(self, z: Array, route: Route | None, carry: Array, shown: Array) -> None:
-        each = z
-        if route is not None:
-            before = np.concatenate([route.mean, route.root], axis=2)
-            each = np.concatenate([z, np.roll(before, 1, axis=1), before], axis=2)
-        for step, shared, first, count in self.runs:
-            step.run(carry, [each], shared, shown, first, 1, count)
+        R_roots = factor(model.covariances(np.arange(K)))
+        G_mask = (gains != 0).any(axis=0)
+        R_mask = (R_roots != 0).any(axis=0)
+        G = np.zeros((K, int(G_mask.sum())))
+        G[moving] = gains[:, G_mask]
+        return cls(G_mask, R_mask, G, R_roots[:, R_mask])
 
 
-def _programs(recording: Recording) -> RowPrograms:
-    assert isinstance(recording.function, RowFunction)
-    return recording.function.programs
-
-
-class _Run(NamedTuple):
+class _Stretch(NamedTuple):
     """Holds epochs, one after another, of the same step."""
 
     step: Step
@@ -478,8 +515,69 @@ class _Run(NamedTuple):
     count: int
 
 
-class _States(NamedTuple):
-    """Holds N(x, F F') of each trial."""
+class _RecordedPasses(Passes):
+    """Passes whose steps are recorded together with f and h."""
+
+    def __init__(self, model: StateModel, kind: Kind) -> None:
+        super().__init__(model, kind)
+        f, h = self.functions
+        of_f, _ = f.places(model.epochs)
+        of_h, _ = h.places(model.epochs)
+        # Epochs that share a recording of f and one of h share a step: a number for each pair.
+        pairs = of_f * len(h.recordings) + of_h
+        noise = _Noise.of(model)
+        steps: dict[int, tuple[Step, Array]] = {}
+        for pair in np.unique(pairs).tolist():
+            steps[pair] = self._step_of(np.flatnonzero(pairs == pair), noise)
+        changes = np.flatnonzero(np.diff(pairs)) + 1
+        self.stretches: list[_Stretch] = []
+        for first, end in pairwise([0, *changes.tolist(), model.epochs]):
+            step, shared = steps[int(pairs[first])]
+            # Epoch k lies in row 1 + k: the start is in front.
+            self.stretches.append(_Stretch(step, shared, 1 + first, end - first))
+
+    def _step_of(self, epochs: Array, noise: _Noise) -> tuple[Step, Array]:
+        """Returns the step of epochs that share their recordings, and its shared numbers
+        (1 + K, p)."""
+        model = self.model
+        first = int(epochs[0])
+        f, f_numbers = _recording_at(self.functions[0], epochs, model.epochs)
+        h, h_numbers = _recording_at(self.functions[1], epochs, model.epochs)
+        moves = model.moves(first)
+        recorded = _RecordedStep.of(self, _programs(f) if moves else None, _programs(h), noise)
+        values = {"d": h_numbers, "R": noise.R[epochs]}
+        if moves:
+            values |= {"c": f_numbers, "G": noise.G[epochs]}
+        shared = np.zeros((1 + model.epochs, recorded.shared.size))
+        for name, numbers in values.items():
+            shared[1 + epochs, recorded.shared.at[name]] = numbers
+        return recorded.compiled(), shared
+
+    def forward(self, z: Array, route: Route | None, carry: Array, output: Array) -> None:
+        each = z
+        if route is not None:
+            here = np.concatenate([route.mean, route.root], axis=2)
+            # Row 0 gets the last state, and is never read: stretches begin at row 1.
+            before = np.roll(here, 1, axis=1)
+            each = np.concatenate([z, before, here], axis=2)
+        for step, shared, first, count in self.stretches:
+            step.run(carry, [each], shared, output, first, 1, count)
+
+
+def _recording_at(functions: EpochFunctions, epochs: Array, K: int) -> tuple[Recording, Array]:
+    """Returns the recording that epochs share, and its numbers at each of them."""
+    which, place = functions.places(K)
+    recording = functions.recordings[int(which[epochs[0]])]
+    return recording, recording.numbers[place[epochs]]
+
+
+def _programs(recording: Recording) -> RowPrograms:
+    assert isinstance(recording.function, RowFunction)
+    return recording.function.programs
+
+
+class _TrialStates(NamedTuple):
+    """Holds N(x, F F') of each trial, as arrays; `State` holds that of one, as lists."""
 
     x: Array
     """(trials, n)"""
@@ -487,67 +585,84 @@ class _States(NamedTuple):
     """(trials, n, n)"""
 
 
-class _ByEpoch(Passes):
-    """Passes whose functions are called epoch by epoch, and linearised by the rule in NumPy."""
+class _PassesByEpoch(Passes):
+    """Passes whose functions are called epoch by epoch, and linearised by the rule in NumPy.
+
+    Its iterations, gate and slopes about a path are those of `_RecordedStep`, which names the tests
+    that hold them equal.
+    """
 
     numbers = _NUMBERS_BY_EPOCH
 
     def __init__(self, model: StateModel, kind: Kind) -> None:
         super().__init__(model, kind)
-        self._step = functools.cache(self._made)
+        self._prediction = functools.cache(self._make_prediction)
+        self._reading = functools.cache(self._make_reading)
 
-    def _made(self, text: Callable[..., Any], columns: int, gate: float | None = None) -> Step:
-        """Returns the step of a transition or of readings with a root of noise of so many
-        columns."""
-        n = self.sizes.n
-        m = self.sizes.m
-        smooths = self.sizes.smooths
-        if text is _move:
-            each = {"y": n, "AF": full(n, n), "N": full(n, columns)}
-            shown = self.sizes.moved if smooths else _NOTHING
-        else:
-            each = {"z": m, "y": m, "HF": full(m, n), "M": full(m, columns), "H": full(m, n)}
-            if self.kind.tails:
-                each["own"] = m
-            shown = self.sizes.shown
-        options: dict[str, Any] = {"smooths": smooths}
-        if gate is not None:
-            options["gate"] = gate
-        if self.kind.tails and text is _read:
+    def _make_prediction(self, columns: int) -> Step:
+        """Returns the step of a transition whose noise has a root of so many columns."""
+        n = self.layouts.n
+        smooths = self.kind.smooths
+        each: dict[str, Shape] = {"y": n, "AF": full(n, n), "N": full(n, columns)}
+        output = self.layouts.transition_rows if smooths else _EMPTY
+        return self._made(_predict_step, {"smooths": smooths}, each, output)
+
+    def _make_reading(self, columns: int, gate: float | None) -> Step:
+        """Returns the step of readings whose noise has a root of so many columns."""
+        n = self.layouts.n
+        m = self.layouts.m
+        each: dict[str, Shape] = {"z": m, "y": m, "HF": full(m, n), "M": full(m, columns)}
+        each["H"] = full(m, n)
+        options: dict[str, Any] = {"smooths": self.kind.smooths, "gate": gate}
+        if self.kind.tails:
+            each["variances"] = m
             options["tails"] = self.kind.tails
-        recorded = partial(text, **options)
-        what = text.__name__, options
-        arrays = [Layout(**{name: shape}) for name, shape in each.items()]
-        return named_step(recorded, what, self.sizes.carried, arrays, _NOTHING, shown)
+        return self._made(_update_step, options, each, self.layouts.filter_output)
 
-    def there(self, z: Array, route: Route | None, carry: Array, shown: Array) -> None:
-        n = self.sizes.n
-        at = self.sizes.told.at
-        told = slice(at["moved"].start, at["noise"].stop)
+    def _made(
+        self,
+        function: Callable[..., Any],
+        options: dict[str, Any],
+        each: dict[str, Shape],
+        output: Layout,
+    ) -> Step:
+        identity = function.__name__, options
+        arrays = [Layout(**{name: shape}) for name, shape in each.items()]
+        carry = self.layouts.filter_carry
+        return named_step(partial(function, **options), identity, carry, arrays, _EMPTY, output)
+
+    def forward(self, z: Array, route: Route | None, carry: Array, output: Array) -> None:
+        n = self.layouts.n
+        at = self.layouts.smoother_input.at
+        of_transition = slice(at["transition_X"].start, at["transition_Y"].stop)
+        # States that stand still keep their unit noise: X = I and Y = 0.
         still = np.concatenate([np.eye(n).ravel(), np.zeros(n * (n + 1) // 2)])
         for k in range(self.model.epochs):
-            moved = still
+            rows = still
             before = here = None
             if route is not None:
-                before, here = (self._state(route.mean[:, i], route.root[:, i]) for i in (k, k + 1))
+                before = self._states(route.mean[:, k], route.root[:, k])
+                here = self._states(route.mean[:, k + 1], route.root[:, k + 1])
             if self.model.moves(k):
-                moved = self._moved(k, carry, before, here)
-            self._read(k, z[:, k + 1], carry, here, shown[:, k + 1])
+                rows = self._predict(k, carry, before, here)
+            self._update(k, z[:, k + 1], carry, here, output[:, k + 1])
             if self.kind.smooths:
-                shown[:, k + 1, told] = moved
+                output[:, k + 1, of_transition] = rows
 
-    def _state(self, mean: Array, root: Array) -> _States:
-        return _States(mean, unpacked(root, self.sizes.n))
+    def _states(self, mean: Array, root: Array) -> _TrialStates:
+        return _TrialStates(mean, unpacked(root, self.layouts.n))
 
-    def _carried(self, carry: Array) -> _States:
-        at = self.sizes.carried.at
-        return self._state(carry[:, at["x"]].copy(), carry[:, at["F"]])
+    def _states_of(self, carry: Array) -> _TrialStates:
+        at = self.layouts.filter_carry.at
+        return self._states(carry[:, at["x"]].copy(), carry[:, at["F"]])
 
-    def _moved(self, k: int, carry: Array, before: _States | None, here: _States | None) -> Array:
-        """Advances what is carried by a transition, and returns what that tells a smoother."""
+    def _predict(
+        self, k: int, carry: Array, before: _TrialStates | None, here: _TrialStates | None
+    ) -> Array:
+        """Advances the carry by a transition, and returns its rows for a smoother."""
         model = self.model
         rule = self.kind.rule
-        state = self._carried(carry)
+        state = self._states_of(carry)
         at = before or state
         nearest = model.nearest_state if model.state_periods else None
         law = rule.linearised(model.transition_into(k), at.x, at.F, nearest)
@@ -559,61 +674,67 @@ class _ByEpoch(Passes):
         y, AF = _at(law, state, at)
         if here is not None:
             y = model.nearest_state(y, here.x)
-        return self._run(_move, N, carry, [y, AF])
+        return _run(self._prediction(N.shape[2]), carry, [y, AF, N])
 
-    def _read(self, k: int, z: Array, carry: Array, here: _States | None, shown: Array) -> None:
-        """Takes in readings z (trials, m), and fills what is shown (trials, s)."""
+    def _update(
+        self, k: int, z: Array, carry: Array, here: _TrialStates | None, output: Array
+    ) -> None:
+        """Takes in readings z (trials, m), and fills the output (trials, o)."""
         model = self.model
         rule = self.kind.rule
-        state = self._carried(carry)
+        state = self._states_of(carry)
         at = here or state
         nearest = model.nearest if model.periods else None
-        begun = carry.copy()
+        predicted_carry = carry.copy()
         gate = self.kind.gate
+        # Slopes by points about a path that is nearly known may be round-off themselves: they stay
+        # 0, and the doubt with them.
+        slopes_in_doubt = self.kind.about_path and isinstance(rule, SigmaPoints)
         for _ in range(self.kind.iterations):
             law = rule.linearised(model.observation_at(k), at.x, at.F, nearest)
-            if model.R_by_state:
-                R = rule.mean(partial(model.R_at, k=k), at.x, at.F)
-            else:
-                R = model.R(k)[None]
-            root = factor(R)
-            after = []
-            if self.kind.tails:
-                root = root * np.sqrt([one.least for one in self.kind.tails])[:, None]
-                after = [np.broadcast_to(np.diagonal(R, axis1=1, axis2=2), z.shape)]
-            M = law.noise_root(root)
+            R = self._noise(k, at)
+            M = law.noise_root(self._least_root(R))
             y, HF = _at(law, state, at)
             y = model.nearest(y, np.where(np.isfinite(z), z, y))
-            # Slopes by points about a path that is nearly known may be round-off themselves.
-            untold = self.kind.about and isinstance(rule, SigmaPoints)
-            H = np.zeros(HF.shape) if untold else law.slopes(at.F)
-            carry[:] = begun
-            shown[:] = self._run(_read, M, carry, [z, y, HF], [H, *after], gate)
-            at = self._carried(carry)
+            H = np.zeros(HF.shape) if slopes_in_doubt else law.slopes(at.F)
+            each = [z, y, HF, M, H]
+            if self.kind.tails:
+                each.append(np.broadcast_to(np.diagonal(R, axis1=1, axis2=2), z.shape))
+            # Each iteration takes the readings in anew.
+            carry[:] = predicted_carry
+            output[:] = _run(self._reading(M.shape[2], gate), carry, each)
+            at = self._states_of(carry)
             if gate is not None:
                 # What the first linearisation takes for missing is missing to all.
-                predicted = self.sizes.shown.part(shown, "predicted")
+                predicted = self.layouts.filter_output.part(output, "predicted")
                 z = np.where(np.isfinite(predicted), z, np.nan)
                 gate = None
 
-    def _run(
-        self,
-        text: Callable[..., Any],
-        noise: Array,
-        carry: Array,
-        before: Sequence[Array],
-        after: Sequence[Array] = (),
-        gate: float | None = None,
-    ) -> Array:
-        trials = len(carry)
-        step = self._step(text, noise.shape[2], gate)
-        each = [own(part).reshape(trials, 1, -1) for part in (*before, noise, *after)]
-        out = np.empty((trials, 1, step.shown))
-        step.run(carry, each, _NONE, out, 0, 1, 1)
-        return out[:, 0]
+    def _noise(self, k: int, at: _TrialStates) -> Array:
+        """Returns R of each trial, or of all (1, m, m)."""
+        model = self.model
+        if model.R_by_state:
+            return self.kind.rule.mean(partial(model.R_at, k=k), at.x, at.F)
+        return model.R(k)[None]
+
+    def _least_root(self, R: Array) -> Array:
+        """Returns a root of R, or of the least noise of readings with tails."""
+        root = factor(R)
+        if self.kind.tails:
+            root = root * np.sqrt([one.least for one in self.kind.tails])[:, None]
+        return root
 
 
-def _at(law: Linearised, state: _States, at: _States) -> tuple[Array, Array]:
+def _run(step: Step, carry: Array, parts: Sequence[Array]) -> Array:
+    """Advances carry by a step of one epoch, and returns its output (trials, o)."""
+    trials = len(carry)
+    each = [own(part).reshape(trials, 1, -1) for part in parts]
+    output = np.empty((trials, 1, step.shown))
+    step.run(carry, each, _NO_SHARED, output, 0, 1, 1)
+    return output[:, 0]
+
+
+def _at(law: Linearised, state: _TrialStates, at: _TrialStates) -> tuple[Array, Array]:
     """Returns A x + b and A F of a state by a law about the states `at`."""
     if at is state:
         return law.y, law.AF
@@ -621,11 +742,12 @@ def _at(law: Linearised, state: _States, at: _States) -> tuple[Array, Array]:
     return law.y + multiply(A, state.x - at.x), np.matmul(A, state.F)
 
 
-def passes(model: StateModel, kind: Kind) -> Passes:
+def passes_of(model: StateModel, kind: Kind) -> Passes:
     """Returns the passes of a kind along a model."""
     kept = kept_of(model)
     if kind not in kept:
-        kept[kind] = (_Together if _suits(model, kind) else _ByEpoch)(model, kind)
+        form = _RecordedPasses if _can_be_recorded(model, kind) else _PassesByEpoch
+        kept[kind] = form(model, kind)
     return kept[kind]
 
 
@@ -639,7 +761,7 @@ def kept_of(model: StateModel) -> Kept:
     return kept
 
 
-def _suits(model: StateModel, kind: Kind) -> bool:
+def _can_be_recorded(model: StateModel, kind: Kind) -> bool:
     """Tells whether the functions of a model can be part of recorded steps."""
     if model.gain_by_state or model.R_by_state:
         return False
@@ -648,7 +770,7 @@ def _suits(model: StateModel, kind: Kind) -> bool:
 
 
 def _operations(model: StateModel, law: Law, iterations: int) -> float:
-    """Counts the operations of a step, as it is about; infinite if f or h is not recorded."""
+    """Counts the operations of a step roughly; infinite if f or h is not recorded."""
     f, h = model.epoch_functions
     moving = [one for one in f.recordings if model.moves(int(one.epochs[0]))]
     each = []

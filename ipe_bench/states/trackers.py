@@ -24,7 +24,7 @@ from ipe_bench.states.algebra import factor, lower_solve, transposed
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.layouts import Layout
 from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
-from ipe_bench.states.passes import Kind, Passed, Passes, Route, passes
+from ipe_bench.states.passes import Kind, Passed, Passes, Route, passes_of
 from ipe_bench.states.redone import believed
 from ipe_bench.states.steps import BEYOND
 from ipe_bench.states.student import Mixture, evidence, mixture, scores
@@ -339,17 +339,17 @@ def _passed(
     model: StateModel, z: Array, kind: Kind, path: Tracks | None, start: Normal | None
 ) -> tuple[Tracks, Tracks]:
     """Runs passes of as many trials at once as memory allows."""
-    there = passes(model, kind)
+    passes = passes_of(model, kind)
     begun = start or spread_prior(model, len(z))
-    route = None if path is None else _route(path, there)
-    at_once = there.at_once
+    route = None if path is None else _route(path, passes)
+    at_once = passes.at_once
     parts = []
     for i in range(0, max(len(z), 1), at_once):
         rows = slice(i, i + at_once)
         about = None if route is None else Route(route.mean[rows], route.root[rows])
         first = Normal(begun.mean[rows], begun.covariance[rows])
-        found = there.run(z[rows], about, None if start is None else first)
-        parts.append(_found(there, found, z[rows], first))
+        found = passes.run(z[rows], about, None if start is None else first)
+        parts.append(_found(passes, found, z[rows], first))
     tracks, smooth = parts[0] if len(parts) == 1 else map(Tracks.join, zip(*parts, strict=True))
     calls = _calls(model, kind)
     tracks.calls = np.full(len(z), calls)
@@ -365,30 +365,31 @@ def _calls(model: StateModel, kind: Kind) -> float:
     return float(of_f * moves + of_h * kind.iterations * model.epochs)
 
 
-def _route(path: Tracks, there: Passes) -> Route:
+def _route(path: Tracks, passes: Passes) -> Route:
     """Returns the states of a path."""
     mean = np.concatenate([path.start.mean[:, None], path.mean], axis=1)
     # Tangents take no covariance.
-    size = there.sizes.unit.size - there.sizes.n
+    n = passes.layouts.n
+    size = n * (n + 1) // 2
     root = np.zeros((*mean.shape[:2], size)) if path.root is None else path.root
     return Route(mean, root)
 
 
-def _found(there: Passes, found: Passed, z: Array, start: Normal) -> tuple[Tracks, Tracks]:
+def _found(passes: Passes, found: Passed, z: Array, start: Normal) -> tuple[Tracks, Tracks]:
     """Returns what passes say of some trials: a filter, and the smoother behind it. Where states or
     their covariances are so large that floats hold no digits of the readings, a filter says
     nothing."""
-    layout = there.sizes.shown
-    n = there.sizes.n
-    after = found.shown[:, 1:]
+    layout = passes.layouts.filter_output
+    n = passes.layouts.n
+    after = found.filtered[:, 1:]
     predicted = layout.part(after, "predicted")
     given = np.isfinite(z)
     # A reading beyond the gate is missing, and has no innovation.
     gated = given & np.isnan(predicted) & np.isfinite(layout.part(after, "nis"))
     seen = given & ~gated
-    carried = there.sizes.carried
-    log_likelihood = carried.part(found.carried, "log_likelihood")[:, 0].copy()
-    lost = carried.part(found.carried, "doubt")[:, 0] > BEYOND
+    carry = passes.layouts.filter_carry
+    log_likelihood = carry.part(found.carry, "log_likelihood")[:, 0].copy()
+    lost = carry.part(found.carry, "doubt")[:, 0] > BEYOND
     tracks = Tracks(
         mean=layout.part(after, "x"),
         covariance=layout.part(after, "covariance", n, n),
@@ -400,22 +401,22 @@ def _found(there: Passes, found: Passed, z: Array, start: Normal) -> tuple[Track
         start=start,
         predicted=predicted,
         predicted_deviation=layout.part(after, "deviation"),
-        root=layout.part(found.shown, "F"),
-        gated=None if there.kind.gate is None else gated,
+        root=layout.part(found.filtered, "F"),
+        gated=None if passes.kind.gate is None else gated,
     )
-    if there.kind.tails:
-        _judge(tracks, layout, after, there.kind.tails)
+    if passes.kind.tails:
+        _judge(tracks, layout, after, passes.kind.tails)
     tracks.lose(lost)
-    if found.back is None:
+    if found.smoothed is None:
         return tracks, tracks
-    of_states = there.sizes.back
-    mean = of_states.part(found.back, "x")
-    covariance = of_states.part(found.back, "covariance", n, n)
-    smooth = Tracks.empty(there.model, len(z))
+    of_states = passes.layouts.smoother_output
+    mean = of_states.part(found.smoothed, "x")
+    covariance = of_states.part(found.smoothed, "covariance", n, n)
+    smooth = Tracks.empty(passes.model, len(z))
     smooth.start = Normal(mean[:, 0], covariance[:, 0])
     smooth.mean = mean[:, 1:]
     smooth.covariance = covariance[:, 1:]
-    smooth.root = of_states.part(found.back, "F")
+    smooth.root = of_states.part(found.smoothed, "F")
     return tracks, smooth
 
 
