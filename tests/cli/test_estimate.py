@@ -167,6 +167,8 @@ def test_columns_are_left_out_on_purpose(estimate, misra, tmp_path):
     assert "ignore_columns=[remark]" in printed
     code, printed, answer = estimate(*SATURATION, *LM, "readings=odd.csv", "ignore_columns=remark")
     assert code == 0, printed
+    # Short forms leave out columns, too, which is nobody's purpose.
+    assert "Left out: columns remark." in printed
     assert answer["left_out"] == "remark"
     _, _, whole = estimate(*SATURATION, *LM, "readings=my.csv")
     assert of(answer, "estimates") == of(whole, "estimates")

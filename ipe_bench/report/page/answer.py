@@ -124,7 +124,7 @@ class Answer(Labelled[Fit]):
     examination: Examination | None
     """Examination of the least minimum; None if no estimator without a prior found any."""
     left_out: str = ""
-    """The columns of the files that were left out on purpose."""
+    """The columns of the files that were left out."""
 
     @classmethod
     def to(
@@ -455,7 +455,7 @@ def _notes(answer: Answer) -> Iterator[str]:
     if answer.model.fixed:
         yield f"Fixed: {_values(answer.model.fixed)}"
     if answer.left_out:
-        yield f"Left out on purpose: columns {answer.left_out}."
+        yield f"Left out: columns {answer.left_out}."
     failing = _labels(one for one in fits if not one.passes)
     if failing:
         yield f"Values in parentheses were rejected and have no standard errors: {failing}."
