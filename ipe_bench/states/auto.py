@@ -1,4 +1,10 @@
-"""The default tracker: it goes further only where the readings say that it has to."""
+"""The default tracker: it goes further only where the readings say that it has to.
+
+A *stage* is a way to an answer; each trial ends at one of those below. The cheap stages, two
+Gaussian smoothers, run first, and what their innovations or the cost of their paths say decides
+which trials go on. Trials go on alone, so that a batch pays only for those that need it. Of a
+scalar state whose readings fold, the exact density on a grid takes the place of all stages.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import gather, put, take
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.options import Quantile
 from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import StateModel
@@ -69,26 +75,28 @@ class AutoTracker(Tracker):
         return why if why and grid_of(model) is None else None
 
     def track(self, model: StateModel, z: Array) -> Tracks:
-        tracks, first = passed(model, z, Taylor())
+        smooth, filtered = passed(model, z, Taylor())
         if may_fold(model):
-            tracks.calls += calls(model)
-        exact, rows = exact_tracks(model, z, first, gate=self.gate)
+            smooth.calls += calls(model)
+        exact, rows = exact_tracks(model, z, filtered, gate=self.gate)
         if not rows.size:
-            return self._rest(model, z, tracks, first)
-        parts = [(rows, self._told(model, exact, tracks.calls[rows]))]
+            return self._by_paths_within_gate(model, z, smooth, filtered)
+        on_grid = rows, self._on_grid(model, exact, smooth.calls[rows])
         others = np.setdiff1d(np.arange(len(z)), rows)
-        if others.size:
-            begun = take(tracks, others), take(first, others)
-            parts.append((others, self._rest(model, z[others], *begun)))
-        return gather(parts)
+        if not others.size:
+            return gather([on_grid])
+        found = take(smooth, others), take(filtered, others)
+        by_paths = self._by_paths_within_gate(model, z[others], *found)
+        return gather([on_grid, (others, by_paths)])
 
-    def _told(self, model: StateModel, exact: Tracks, begun: Array) -> Tracks:
-        """Returns what the smoother of a grid says of trials, after so many calls (trials,)."""
-        trials = len(begun)
+    def _on_grid(self, model: StateModel, exact: Tracks, calls_before: Array) -> Tracks:
+        """Returns the tracks of trials whose exact density is known, after so many calls
+        (trials,)."""
+        trials = len(calls_before)
         tracks = Tracks.empty(model, trials)
         tracks.mean = exact.mean
         tracks.covariance = exact.covariance
-        tracks.calls = begun + exact.calls
+        tracks.calls = calls_before + exact.calls
         tracks.cost = exact.nis.sum(axis=1)
         tracks.stage = np.full(trials, EXACT)
         tracks.gated = exact.gated
@@ -100,73 +108,88 @@ class AutoTracker(Tracker):
             tracks.other_p = np.full(trials, np.nan)
         return tracks
 
-    def _rest(self, model: StateModel, z: Array, tracks: Tracks, first: Tracks) -> Tracks:
+    def _by_paths_within_gate(
+        self, model: StateModel, z: Array, smooth: Tracks, filtered: Tracks
+    ) -> Tracks:
         """Tracks by paths, without the readings beyond a gate if there is one."""
         if self.gate is None:
-            return self._by_paths(model, z, tracks, first)
+            return self._by_paths(model, z, smooth, filtered)
 
         def track(z: Array) -> Tracks:
             return self._by_paths(model, z, *passed(model, z, Taylor()))
 
         return leaving_out(track, model, z, self.gate)
 
-    def _by_paths(self, model: StateModel, z: Array, tracks: Tracks, first: Tracks) -> Tracks:
-        """Tracks by paths of largest density, from the smoothed tracks of the first filter."""
-        by_state = model.gain_by_state or model.R_by_state
-        doubtful = np.flatnonzero(self.descent.improbable(z, first.nis.sum(axis=1)))
-        if by_state:
-            return self._likelier(model, z, tracks, first, doubtful)
+    def _by_paths(self, model: StateModel, z: Array, smooth: Tracks, filtered: Tracks) -> Tracks:
+        """Tracks by paths of largest density, from the tracks of the extended filter and its
+        smoother."""
+        doubtful = np.flatnonzero(self.descent.improbable(z, filtered.nis.sum(axis=1)))
+        if model.gain_by_state or model.R_by_state:
+            return self._likelier(model, z, smooth, filtered, doubtful)
         density = PathDensity.of(model, z)
-        paths = Descent.of(density, tracks)
-        stage = np.full(len(z), EXTENDED)
-        if doubtful.size:
-            some = density.subset(doubtful)
-            other = Descent.of(some, passed(model, some.z, Unscented())[0])
-            stage[doubtful[paths.beaten(other, doubtful)]] = UNSCENTED
-            paths = paths.improved(other, doubtful)
-        paths = self.descent.descended(density, paths)
-        arrived = (paths.status == Status.CONVERGED) & (paths.iterations == 1)
-        stage[~arrived] = DAMPED
-        paths, by = self.descent.restarted(density, paths, tracks.start)
-        stage = np.where(by > 0, AGAIN + by - 1, stage)
-        # The path of an affine model has no second one beside it.
-        rows = np.flatnonzero(stage >= DAMPED)
-        if not rows.size:
-            return replace(with_second(density, paths, paths), stage=stage)
-        found = take(paths, rows)
-        found = in_first_turn(density.subset(rows), found)
-        mirror = mirrored(self.descent, density.subset(rows), found)
-        found, second, better = ordered(found, mirror)
-        stage[rows[better]] = MIRRORED
-        paths = put(paths, rows, found)
-        tracks = with_second(density, paths, put(paths, rows, second))
+        begun, stage = self._extended_or_unscented(density, smooth, doubtful)
+        descended = self.descent.descended(density, begun)
+        # A path that the first step hardly moves is the answer of the stage that it comes from.
+        unmoved = (descended.status == Status.CONVERGED) & (descended.iterations == 1)
+        stage[~unmoved] = DAMPED
+        found, draws = self.descent.restarted(density, descended, smooth.start)
+        stage = np.where(draws > 0, AGAIN + draws - 1, stage)
+        # Paths that did not move, as those of affine models, have no second one beside them.
+        moved = np.flatnonzero(stage >= DAMPED)
+        if not moved.size:
+            return replace(with_second(density, found, found), stage=stage)
+        first, second, swapped = self._beside_mirrored(density.subset(moved), take(found, moved))
+        stage[moved[swapped]] = MIRRORED
+        tracks = with_second(density, put(found, moved, first), put(found, moved, second))
         return replace(tracks, stage=stage)
+
+    def _extended_or_unscented(
+        self, density: PathDensity, smooth: Tracks, doubtful: NDArray[np.intp]
+    ) -> tuple[Descent, NDArray[np.intp]]:
+        """Returns the extended smoother's paths, or in doubtful trials the unscented smoother's
+        where these cost less, and the stage of each."""
+        extended = Descent.of(density, smooth)
+        stage = np.full(len(density.z), EXTENDED)
+        if not doubtful.size:
+            return extended, stage
+        some = density.subset(doubtful)
+        unscented = Descent.of(some, passed(density.model, some.z, Unscented())[0])
+        stage[doubtful[extended.beaten(unscented, doubtful)]] = UNSCENTED
+        return extended.improved(unscented, doubtful), stage
+
+    def _beside_mirrored(
+        self, density: PathDensity, paths: Descent
+    ) -> tuple[Descent, Descent, Mask]:
+        """Returns each path and the one from its mirrored start, the more probable one in front,
+        and where that is the mirrored one."""
+        paths = in_first_turn(density, paths)
+        return ordered(paths, mirrored(self.descent, density, paths))
 
     def _likelier(
         self,
         model: StateModel,
         z: Array,
-        tracks: Tracks,
-        first: Tracks,
+        smooth: Tracks,
+        filtered: Tracks,
         doubtful: NDArray[np.intp],
     ) -> Tracks:
-        """Returns the smoother of the first filter, by tangents, or in doubtful trials that by
-        points if its filter is likelier."""
-        tracks.lose(np.isnan(first.log_likelihood))
-        cost = tracks.cost = first.nis.sum(axis=1)
-        stage = tracks.stage = np.full(len(z), EXTENDED)
+        """Returns the extended smoother's tracks, or in doubtful trials the unscented smoother's
+        where its filter is likelier."""
+        smooth.lose(np.isnan(filtered.log_likelihood))
+        cost = filtered.nis.sum(axis=1)
+        stage = np.full(len(z), EXTENDED)
         if not doubtful.size:
-            return tracks
-        other, second = smoothed(model, z[doubtful], Unscented())
-        tracks.calls[doubtful] += second.calls
-        before = first.log_likelihood[doubtful]
+            return replace(smooth, cost=cost, stage=stage)
+        unscented, unscented_filter = smoothed(model, z[doubtful], Unscented())
+        smooth.calls[doubtful] += unscented_filter.calls
+        before = filtered.log_likelihood[doubtful]
         # A filter that breaks down, as at points that have no noise level, is not likelier.
-        likelier = np.isnan(before) | (second.log_likelihood > before)
+        likelier = np.isnan(before) | (unscented_filter.log_likelihood > before)
         rows = doubtful[likelier]
         stage[rows] = UNSCENTED
-        cost[rows] = second.nis.sum(axis=1)[likelier]
-        tracks.mean[rows] = other.mean[likelier]
-        tracks.covariance[rows] = other.covariance[likelier]
-        for mine, its in zip(tracks.start, other.start, strict=True):
-            mine[rows] = its[likelier]
-        return tracks
+        cost[rows] = unscented_filter.nis.sum(axis=1)[likelier]
+        smooth.mean[rows] = unscented.mean[likelier]
+        smooth.covariance[rows] = unscented.covariance[likelier]
+        smooth.start.mean[rows] = unscented.start.mean[likelier]
+        smooth.start.covariance[rows] = unscented.start.covariance[likelier]
+        return replace(smooth, cost=cost, stage=stage)

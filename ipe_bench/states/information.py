@@ -200,13 +200,13 @@ def steps_of(m: int, start: Shape, gains: Shape, damped: bool) -> Steps:
     covariance = Layout(covariance=square)
 
     def made(
-        text: Callable[..., Any],
+        function: Callable[..., Any],
         carried: Layout,
         each: Sequence[Layout],
         shared: Layout,
         shown: Layout,
     ) -> Step:
-        return named_step(text, text.__name__, carried, each, shared, shown)
+        return named_step(function, function.__name__, carried, each, shared, shown)
 
     # A step takes the first numbers of a row of `follows`: M and b alone, or N, too.
     return Steps(

@@ -1,5 +1,11 @@
-"""Steps whose numbers have names: vectors and matrices that lie one after another in the rows of
-`engine.scan`."""
+"""Gives names to the numbers of steps that `engine.scan` runs along epochs.
+
+A step of `engine.scan` takes and gives rows of numbers; here it is written as a *step function* of
+named vectors and matrices, in lists. A `Layout` says where each of them lies in a row. The function
+is run once on unknowns, which records its program, and only if no machine code is kept from before.
+So what is kept is found by a key that tells the step function without running it: its *identity*,
+the layouts, and the files in which step functions stand.
+"""
 
 from __future__ import annotations
 
@@ -21,29 +27,35 @@ _NAMES = (
     *("information.py", "layouts.py", "linearisation.py", "passes.py", "steps.py", "student.py"),
 )
 _FILES = [Path(__file__).with_name(name) for name in _NAMES]
+"""Files that step functions are written in: machine code from before a change in them is not used
+after it."""
 
 Shape: TypeAlias = "int | tuple[tuple[bool, ...], ...]"
 """The length of a vector, or the places of a matrix whose numbers are kept; the others are 0."""
 
 
 def full(rows: int, columns: int) -> Shape:
+    """Returns the shape of a matrix of which every number is kept."""
     return ((True,) * columns,) * rows
 
 
 def triangle(n: int) -> Shape:
+    """Returns the shape of a lower triangular matrix."""
     return tuple(tuple(j <= i for j in range(n)) for i in range(n))
 
 
 class Layout:
-    """Says where parts of a row of numbers lie."""
+    """Says where parts of a row of numbers lie, one after another."""
 
     def __init__(self, **shapes: Shape) -> None:
         self.shapes = shapes
-        sizes = [one if isinstance(one, int) else sum(map(sum, one)) for one in shapes.values()]
-        ends = [*accumulate(sizes, initial=0)]
-        self.size = ends[-1]
-        self.at = {name: slice(*at) for name, at in zip(shapes, pairwise(ends), strict=True)}
+        sizes = [_count(shape) for shape in shapes.values()]
+        borders = [*accumulate(sizes, initial=0)]
+        self.size = borders[-1]
+        self.at = {name: slice(*at) for name, at in zip(shapes, pairwise(borders), strict=True)}
 
+    # Names, their order and shapes are all of a layout. So their text decides whether two are
+    # equal, and stands for a layout in the key of a step.
     def __repr__(self) -> str:
         return repr(self.shapes)
 
@@ -54,11 +66,11 @@ class Layout:
         return hash(repr(self))
 
     def parts(self, numbers: Sequence[Any]) -> dict[str, Any]:
-        """Returns the vectors and matrices that these numbers are."""
+        """Returns the vectors and matrices whose numbers these are."""
         return {name: _filled(shape, numbers[self.at[name]]) for name, shape in self.shapes.items()}
 
     def numbers(self, parts: Mapping[str, Any]) -> list[Any]:
-        """Lists the numbers of vectors and matrices."""
+        """Lists the numbers of vectors and matrices, without those of a matrix that are 0."""
         found = []
         for name, shape in self.shapes.items():
             if isinstance(shape, int):
@@ -75,6 +87,11 @@ class Layout:
         return np.ascontiguousarray(part.reshape(*part.shape[:-1], *shape) if shape else part)
 
 
+def _count(shape: Shape) -> int:
+    """Counts the numbers that are kept."""
+    return shape if isinstance(shape, int) else sum(map(sum, shape))
+
+
 def _filled(shape: Shape, numbers: Sequence[Any]) -> list[Any]:
     if isinstance(shape, int):
         return list(numbers)
@@ -83,47 +100,50 @@ def _filled(shape: Shape, numbers: Sequence[Any]) -> list[Any]:
 
 
 def named_step(
-    text: Callable[..., Mapping[str, Any]],
-    what: Any,
-    carried: Layout,
+    function: Callable[..., Mapping[str, Any]],
+    identity: Any,
+    carry: Layout,
     each: Sequence[Layout],
     shared: Layout,
-    shown: Layout,
+    output: Layout,
 ) -> Step:
-    """Returns the step of a text, which takes the named parts of what is carried, of arrays of its
-    trial and of its epoch, and gives those that are carried on and shown. It is recorded only if
-    its machine code is not kept; `what` tells it from other texts of these layouts."""
+    """Returns the step of a step function. That takes the parts of `carry`, of arrays that have a
+    row `each` trial and epoch, and of the row `shared` by all trials of an epoch, and gives the
+    parts of the next carry and of the output. The repr of `identity` tells it from other functions
+    with these layouts, and must be the same in every process."""
 
     def record() -> Program:
         graph = Graph()
         inputs = []
         parts = {}
-        for number, layout in enumerate((carried, *each, shared)):
+        for number, layout in enumerate((carry, *each, shared)):
             unknowns = graph.inputs(f"{number} ", layout.size)
             assert parts.keys().isdisjoint(layout.shapes)
             parts |= layout.parts(unknowns)
             inputs += unknowns
-        found = text(**parts)
-        outputs = [*carried.numbers(found), *shown.numbers(found)]
-        # What is a number, or an input itself, becomes an expression.
+        found = function(**parts)
+        outputs = [*carry.numbers(found), *output.numbers(found)]
+        # A program gives expressions: adding 0 makes one of a plain number, and of an input itself.
         return Program.of([graph.apply("add", a, 0.0) for a in outputs], inputs)
 
-    key = repr((what, carried, each, shared, shown, compiled.digest_of(*_FILES)))
-    sizes = (carried.size, tuple(one.size for one in each), shared.size, shown.size)
+    key = repr((identity, carry, each, shared, output, compiled.digest_of(*_FILES)))
+    sizes = (carry.size, tuple(one.size for one in each), shared.size, output.size)
     return Step(hashlib.sha256(key.encode()).hexdigest(), record, *sizes)
 
 
 def packed(F: Array) -> Array:
     """Returns the numbers (..., n (n + 1) / 2) of triangular matrices F (..., n, n)."""
-    return F[(..., *_places(F.shape[-1]))]
+    return F[(..., *_below_diagonal(F.shape[-1]))]
 
 
 def unpacked(numbers: Array, n: int) -> Array:
+    """Returns the triangular matrices F (..., n, n) of their numbers."""
     F = np.zeros((*numbers.shape[:-1], n, n))
-    F[(..., *_places(n))] = numbers
+    F[(..., *_below_diagonal(n))] = numbers
     return F
 
 
 @functools.cache
-def _places(n: int) -> tuple[Array, Array]:
+def _below_diagonal(n: int) -> tuple[Array, Array]:
+    """Returns rows and columns of a triangle's places, those of the diagonal included."""
     return np.tril_indices(n)

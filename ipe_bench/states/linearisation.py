@@ -191,14 +191,14 @@ def _spread(m: Array, F: Array, s: Array) -> Array:
     trials, n = m.shape
     states = Layout(x=n, F=triangle(n))
     at = Layout(s=n)
-    step = _along_points(_spread_text, states, (), at, Layout(y=n))
+    step = _along_points(_spread_step, states, (), at, Layout(y=n))
     carry = np.concatenate([m, packed(F)], axis=1)
     points = np.empty((trials, *s.shape))
     step.run(carry, [], s, points, 0, 1, len(s))
     return points
 
 
-def _spread_text(x: Any, F: Any, s: Any) -> dict[str, Any]:
+def _spread_step(x: Any, F: Any, s: Any) -> dict[str, Any]:
     return {"x": x, "F": F, "y": plus(x, F, s)}
 
 
@@ -217,17 +217,17 @@ def _regressed(y: Array, mean: Array, s: Array, c: Array) -> tuple[Array, Array]
     sums = Layout(mean=m, M=full(m, n))
     carry = np.concatenate([mean, np.zeros((trials, m * n))], axis=1)
     out = np.empty((trials, points, 0))
-    step = _along_points(_slopes_text, sums, (values,), at, _NOTHING)
+    step = _along_points(_slopes_step, sums, (values,), at, _NOTHING)
     step.run(carry, [y], weighted, out, 0, 1, points)
     M = sums.part(carry, "M", m, n)
     rest = Layout(**sums.shapes, W=full(m, m))
     carry = np.concatenate([carry, np.zeros((trials, m * m))], axis=1)
-    step = _along_points(_rest_text, rest, (values,), at, _NOTHING)
+    step = _along_points(_rest_step, rest, (values,), at, _NOTHING)
     step.run(carry, [y], weighted, out, 0, 1, points)
     return M, rest.part(carry, "W", m, m)
 
 
-def _slopes_text(mean: Any, M: Any, y: Any, s: Any, c: Any) -> dict[str, Any]:
+def _slopes_step(mean: Any, M: Any, y: Any, s: Any, c: Any) -> dict[str, Any]:
     d = [c[0] * (a - middle) for a, middle in zip(y, mean, strict=True)]
     rows = zip(M, d, strict=True)
     return {
@@ -236,7 +236,7 @@ def _slopes_text(mean: Any, M: Any, y: Any, s: Any, c: Any) -> dict[str, Any]:
     }
 
 
-def _rest_text(mean: Any, M: Any, W: Any, y: Any, s: Any, c: Any) -> dict[str, Any]:
+def _rest_step(mean: Any, M: Any, W: Any, y: Any, s: Any, c: Any) -> dict[str, Any]:
     off = [a - middle for a, middle in zip(y, mean, strict=True)]
     left = [d - dot(row, s) for d, row in zip(off, M, strict=True)]
     rows = zip(W, left, strict=True)
@@ -246,13 +246,13 @@ def _rest_text(mean: Any, M: Any, W: Any, y: Any, s: Any, c: Any) -> dict[str, A
 
 @functools.cache
 def _along_points(
-    text: Callable[..., Any],
+    function: Callable[..., Any],
     carried: Layout,
     each: tuple[Layout, ...],
     shared: Layout,
     shown: Layout,
 ) -> Step:
-    return named_step(text, text.__name__, carried, each, shared, shown)
+    return named_step(function, function.__name__, carried, each, shared, shown)
 
 
 _NOTHING = Layout()
