@@ -96,14 +96,13 @@ def search(
     """Finds the coarsest rung at which readings hold `tolerance` (m,) and states `STATES`.
 
     The search begins at the places `start` (trials,), 1 at least, and trials climb until they are
-    accepted or at the top of the ladder; those that begin there are accepted as they are.
+    accepted or at the top of the ladder, where they are lost unless they follow the solution.
     `simulate` fills these rows of arrays (trials, m) and (trials, *states) with readings and states
     (cases, states, times) at one rung, `unturned` shifts readings that are angles next to others,
     and `in_doubt` selects trials by their states; a row behind these is held against nothing.
     """
     search = _Search(rungs, tolerance, states, simulate, start, unturned, in_doubt)
-    # On a ladder of two rungs the top is all that can be tried.
-    pending = computed = np.flatnonzero(start < max(search.top, 2))
+    pending = computed = np.arange(len(start))
     while len(pending):
         climbing = []
         for place, rows in by_rung(search.tried[pending], pending):

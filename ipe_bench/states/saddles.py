@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, Mask, multiply
+from ipe_bench.basics.linalg import Array, Mask, finite, multiply
 from ipe_bench.states.algebra import root
 from ipe_bench.states.base import Normal
 from ipe_bench.states.whole_paths import PathDensity, Settled
@@ -46,7 +46,7 @@ def _untold(G: Array, covariance: Array) -> Array:
     of each, with the prior's covariance G G' and those after the readings (trials, n, n)."""
     inverse = np.linalg.pinv(G)
     left = inverse @ covariance @ inverse.T
-    known = np.isfinite(left).all(axis=(1, 2))
+    known = finite(left)
     values, vectors = np.linalg.eigh(np.where(known[:, None, None], left, 0.0))
     blind = values >= 1 - _BLIND
     # Weights that differ: their sum lies on no other symmetry, as that of x and y in x - y.

@@ -464,3 +464,32 @@ def test_where_two_step_lengths_are_allowed_they_are_held_against_each_other():
     np.testing.assert_allclose(z[1], np.exp(-3.0 * model.times), rtol=0.0, atol=1e-6)
     # Steps of 0.25 s are unstable where k h = 15.
     assert np.isnan(z[2]).all()
+
+
+@dataclass(frozen=True)
+class Turning(OdeMeasurement):
+    """A point on a circle, which turns at a stated rate."""
+
+    states, outputs, reading_unit, tolerance = 2, ("x",), "", 1e-6
+    parameters = (Parameter("omega", "1/s", 1.0),)
+    nominal = np.array([1.0])
+    times = np.arange(1.0, 6.0)
+
+    def start(self, p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
+        return 1.0, 0.0
+
+    def rhs(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
+        return p[0] * y[1], -p[0] * y[0]
+
+    def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
+        return (y[0],)
+
+    def fastest_rate(self, p: Sequence[Any]) -> Any:
+        return p[0]
+
+
+def test_no_rate_is_too_fast_to_be_checked() -> None:
+    """The shortest steps are 1/1024 s: they follow 600 rad/s, but not 2000."""
+    z = Turning().simulate(np.array([[600.0], [1500.0], [2000.0], [3000.0]]))
+    np.testing.assert_allclose(z[0], np.cos(600.0 * Turning.times), atol=2e-6)
+    assert np.isnan(z[1:]).all()
