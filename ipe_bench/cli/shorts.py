@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn, Self
 
 from ipe_bench.basics.errors import UserError, did_you_mean, place_of, unknown
 from ipe_bench.basics.files import fault_of
@@ -87,20 +87,16 @@ def read(command: str, words: Sequence[str]) -> Short:
         UserError: a file is absent, or does not say which model, parameters or columns are meant.
     """
     refuse_blanks(words)
-    before = ["", *words]
-    kinds = [
-        None if _VALUED.fullmatch(flag) else _kind(word)
-        for flag, word in zip(before, words, strict=False)
-    ]
-    bare = [word for word, kind in zip(words, kinds, strict=True) if kind == "readings"]
-    models = [word for word, kind in zip(words, kinds, strict=True) if kind == "model"]
-    files = [*bare, *(file for word in words for file in _typed_files(word))]
+    given = _sorted(words)
+    files = [*given.files, *given.files_of_keys]
     _refuse_columns(words, files)
-    if not bare and not models:
+    if not given.files and not given.models:
         return Short(list(words))
-    others = [word for word in words if word not in (*bare, *models) and not _typed_files(word)]
+    models = given.models
+    others = given.others
     if not models:
-        models = [word for word in others if _names_reading(word, files)][:1]
+        # y = a*t + b looks like KEY=VALUE: that y is a column tells that it is a formula.
+        models = [word for word in others if _is_formula_for(word, files)][:1]
         others = [word for word in others if word not in models]
     _require_pair(command, models, files, others)
     for file in files:
@@ -108,6 +104,33 @@ def read(command: str, words: Sequence[str]) -> Short:
     if not models:
         return Short(others, files)
     return _Reader(command, models[0], files, others).read()
+
+
+class _Words(NamedTuple):
+    """Holds the words of a command, each in one list."""
+
+    models: list[str]
+    files: list[str]
+    """Files of readings without a key."""
+    files_of_keys: list[str]
+    """Files of `readings=`."""
+    others: list[str]
+    """KEY=VALUE, flags and their values, and what is none of all this."""
+
+
+def _sorted(words: Sequence[str]) -> _Words:
+    given = _Words([], [], [], [])
+    for before, word in zip(["", *words], words, strict=False):
+        kind = "key" if _VALUED.fullmatch(before) else _kind(word)
+        if kind == "model":
+            given.models.append(word)
+        elif kind == "readings":
+            given.files.append(word)
+        elif _files_of_key(word):
+            given.files_of_keys.extend(_files_of_key(word))
+        else:
+            given.others.append(word)
+    return given
 
 
 def _refuse_columns(words: Sequence[str], files: Sequence[str]) -> None:
@@ -130,7 +153,7 @@ def _kind(word: str) -> str:
     return "key"
 
 
-def _typed_files(word: str) -> list[str]:
+def _files_of_key(word: str) -> list[str]:
     """Returns the files of readings=FILE or readings=[A,B]; none of a number."""
     key, _, value = word.partition("=")
     names = [name.strip("'\"") for name in listed(value)]
@@ -139,7 +162,7 @@ def _typed_files(word: str) -> list[str]:
     return names
 
 
-def _reading_named(word: str) -> str:
+def _left_side(word: str) -> str:
     """Returns y of a formula y = a*t + b, which names its reading; empty if the word is none."""
     named = _NAMED.fullmatch(word)
     if named is None or named["reading"] in {*KEYS, *plugins.groups()}:
@@ -147,9 +170,9 @@ def _reading_named(word: str) -> str:
     return named["reading"] if _FORMULA.search(named["formula"]) else ""
 
 
-def _names_reading(word: str, files: Sequence[str]) -> bool:
+def _is_formula_for(word: str, files: Sequence[str]) -> bool:
     """Tells if a word is a formula that names its reading among the columns."""
-    reading = _reading_named(word)
+    reading = _left_side(word)
     if not reading:
         return False
     for file in files:
@@ -171,7 +194,7 @@ def _require_pair(
         raise UserError(f"{models[0]}: is a model, and {typed[0]} is another; give one of them")
     if models and not files:
         _refuse_no_readings(others)
-        example = f"ipe-bench {command} {_shown(models[0])} readings.csv"
+        example = f"ipe-bench {command} {_quoted_model(models[0])} readings.csv"
         raise UserError(f"{models[0]}: is a model without readings; add their file: {example}")
     if files and not models and keys.isdisjoint(_MODELS):
         _refuse_bare_names(others)
@@ -212,7 +235,7 @@ def _refuse_no_model(file: str, words: Sequence[str]) -> None:
                 f'{word}: write the formula alone, "{defined["formula"]}", or behind the name of'
                 " the column of the readings and ="
             )
-        reading = _reading_named(word)
+        reading = _left_side(word)
         if reading:
             _refuse_absent(word, file, reading)
     flags = [word for word in words if word.startswith("-")]
@@ -235,7 +258,7 @@ def _refuse_absent(formula: str, file: str, reading: str) -> NoReturn:
     )
 
 
-def _shown(model: str) -> str:
+def _quoted_model(model: str) -> str:
     return f'"{model}"' if _FORMULA.search(model) and not _FUNCTION.fullmatch(model) else model
 
 
@@ -297,28 +320,32 @@ class _Reader:
 
     # Columns
 
-    def _free(self, taken: Sequence[str]) -> list[str]:
-        """Lists the columns besides those that the model takes, sigma and those left out."""
-        known = {*taken, SIGMA, *self._ignored}
-        free = [name for name in self.columns if name not in known]
-        if len(free) < 2:
-            return free
-        return [name for name in free if name not in self.texts] or free
+    def _columns_left(self, taken: Sequence[str]) -> list[str]:
+        """Lists the columns that may have the readings: those besides the columns that the model
+        takes, sigma and those left out."""
+        left = self._columns_besides(taken)
+        # A column of texts is passed over, but not if nothing else is left: then it is named.
+        if len(left) < 2:
+            return left
+        return [name for name in left if name not in self.texts] or left
 
-    def _remarks(self, taken: Sequence[str], reading: str) -> list[str]:
+    def _text_columns_left(self, taken: Sequence[str], reading: str) -> list[str]:
         """Lists the columns of texts that stand beside the readings, and are left out."""
-        known = {*taken, reading, SIGMA, *self._ignored}
-        others = [name for name in self.columns if name not in known]
-        return [name for name in others if name in self.texts]
+        besides = self._columns_besides([*taken, reading])
+        return [name for name in besides if name in self.texts]
+
+    def _columns_besides(self, taken: Sequence[str]) -> list[str]:
+        known = {*taken, SIGMA, *self._ignored}
+        return [name for name in self.columns if name not in known]
 
     @property
     def _ignored(self) -> list[str]:
         """Lists the columns that are left out."""
-        (typed,) = self._typed("ignore_columns") or [""]
+        (typed,) = self._last_value("ignore_columns") or [""]
         return listed(typed)
 
-    def _typed(self, key: str) -> list[str]:
-        """Returns the last value that was typed for a key."""
+    def _last_value(self, key: str) -> list[str]:
+        """Returns the last value that was typed for a key; an empty list if there is none."""
         values = [word.partition("=")[2] for word in self.others if word.startswith(f"{key}=")]
         return values[-1:]
 
@@ -339,10 +366,13 @@ class _Reader:
                 found.append(quantity(heading))
         return found
 
-    def _reading(self, what: str, taken: Sequence[str], usual: Sequence[str]) -> str:
+    def _reading_column(self, what: str, taken: Sequence[str], usual: Sequence[str]) -> str:
         """Finds the column of the readings: the one that is typed, has a usual name, or is left."""
-        free = self._free(taken)
-        named = [*self._typed("measurement.reading"), *(name for name in usual if name in free)]
+        free = self._columns_left(taken)
+        named = [
+            *self._last_value("measurement.reading"),
+            *(name for name in usual if name in free),
+        ]
         if named:
             unused = [name for name in free if name != named[0]]
             if unused:
@@ -401,7 +431,7 @@ class _Reader:
             return []
         return ["noise=unknown", "noise.by=output"]
 
-    def _noise(self, levels: Sequence[str] = ()) -> str:
+    def _noise_line(self, levels: Sequence[str] = ()) -> str:
         """Says what is taken for the noise of an estimate; other commands say it with its size."""
         stated = any(word.startswith("noise") for word in self.others)
         if stated or self.command != "estimate":
@@ -419,62 +449,60 @@ class _Reader:
         tree = _parsed(file)
         module = _module(file)
         chosen = self._chosen(file, tree, name)
-        arguments = [*chosen.args.posonlyargs, *chosen.args.args]
-        defaults = chosen.args.defaults
-        first = len(arguments) - len(defaults)
-        typed = self._started
-        wanted = [one.arg for one in arguments[:first] if one.arg not in typed]
-        starts = {
-            one.arg: ast.unparse(value)
-            for one, value in zip(arguments[first:], defaults, strict=True)
-            if one.arg not in typed
-        }
-        what = f"{chosen.name}({', '.join(one.arg for one in arguments)})"
-        for column in self._free(wanted):
-            if column in starts:
-                raise UserError(
-                    f"{file}: the argument {column} of {what} has a default, which makes it a"
-                    f" parameter, and {self.files[0]} has a column {column}; remove the default, or"
-                    f" leave the column out by ignore_columns=[{column}]"
-                )
-        absent = [column for column in wanted if column not in self.columns]
-        if absent:
-            free = self._free([*wanted, "reading"])
-            near = did_you_mean(absent[0], free)
-            starts = [f"measurement.start.{name}=1" for name in absent]
-            raise UserError(
-                f"{self.files[0]}: has no {'columns' if absent[1:] else 'column'}"
-                f" {enumerate_few(absent)}, which {what} takes (there are"
-                f" {', '.join(self.columns)}{near}); rename the column, or give a parameter its"
-                f" start: as a default in {file}, or by {self._again(*starts)}"
-            )
+        signature = _Signature.of(chosen, self._typed_starts)
+        self._refuse_default_of_column(file, signature)
+        self._refuse_absent_columns(file, signature)
+        self._refuse_bare(signature.arguments)
         words = ["measurement=function", f"measurement.of={module}:{chosen.name}"]
-        shown = {one.arg: {**starts, **typed}.get(one.arg, "") for one in arguments}
-        shown = {name: value for name, value in shown.items() if value}
-        self._refuse_bare([one.arg for one in arguments])
-        model = f"Model: {what} of {file}{_values(shown)}."
-        read = self._outputs(chosen, what, wanted)
-        if read:
-            levels = self._levels(read)
-            words += [f"measurement.outputs=[{','.join(map(w.quoted, read))}]", *levels]
-            readings = f"Readings: columns {enumerate_few(read)} of {', '.join(self.files)}"
+        model = f"Model: {signature.text} of {file}{_starts_phrase(signature.starts)}."
+        outputs = self._outputs(chosen, signature.text, signature.columns)
+        if outputs:
+            levels = self._levels(outputs)
+            words += [f"measurement.outputs=[{','.join(map(w.quoted, outputs))}]", *levels]
+            readings = f"Readings: columns {enumerate_few(outputs)} of {', '.join(self.files)}"
             readings += f", in the order in which {chosen.name} returns them."
-            return self._short(words, [model, readings, self._noise(levels)])
-        reading = self._reading(what, wanted, ["reading"])
-        words += _reading_word(reading, ("reading",))
-        told = [model, self._told(wanted, reading), self._noise()]
-        return self._short(words, told, self._remarks(wanted, reading))
+            return self._short(words, [model, readings, self._noise_line(levels)])
+        columns = signature.columns
+        reading = self._reading_column(signature.text, columns, ["reading"])
+        words += _key_for_reading(reading, ("reading",))
+        lines = [model, self._readings_line(columns, reading), self._noise_line()]
+        return self._short(words, lines, self._text_columns_left(columns, reading))
+
+    def _refuse_default_of_column(self, file: str, signature: _Signature) -> None:
+        """Refuses an argument that its default makes a parameter, and the file a column."""
+        for column in self._columns_left(signature.columns):
+            if column in signature.defaults:
+                raise UserError(
+                    f"{file}: the argument {column} of {signature.text} has a default, which makes"
+                    f" it a parameter, and {self.files[0]} has a column {column}; remove the"
+                    f" default, or leave the column out by ignore_columns=[{column}]"
+                )
+
+    def _refuse_absent_columns(self, file: str, signature: _Signature) -> None:
+        """Refuses arguments without a default that are no columns."""
+        absent = [column for column in signature.columns if column not in self.columns]
+        if not absent:
+            return
+        left = self._columns_left([*signature.columns, "reading"])
+        near = did_you_mean(absent[0], left)
+        words = [f"measurement.start.{name}=1" for name in absent]
+        raise UserError(
+            f"{self.files[0]}: has no {'columns' if absent[1:] else 'column'}"
+            f" {enumerate_few(absent)}, which {signature.text} takes (there are"
+            f" {', '.join(self.columns)}{near}); rename the column, or give a parameter its"
+            f" start: as a default in {file}, or by {self._again(*words)}"
+        )
 
     def _outputs(self, chosen: ast.FunctionDef, what: str, taken: Sequence[str]) -> list[str]:
         """Finds the column of each array that a function returns in a tuple; none for one array."""
         last = chosen.body[-1]
         if not (isinstance(last, ast.Return) and isinstance(last.value, ast.Tuple)):
             return []
-        typed = self._typed("measurement.outputs")
+        typed = self._last_value("measurement.outputs")
         if typed:
             return [name.strip() for name in typed[0].strip("[]").split(",")]
         arrays = last.value.elts
-        free = [name for name in self._free(taken) if not name.startswith(f"{SIGMA}_")]
+        free = [name for name in self._columns_left(taken) if not name.startswith(f"{SIGMA}_")]
         named = [one.id if isinstance(one, ast.Name) else "" for one in arrays]
         if {*named} <= {*free}:
             unused = [name for name in free if name not in named]
@@ -493,7 +521,7 @@ class _Reader:
         )
 
     @property
-    def _started(self) -> dict[str, str]:
+    def _typed_starts(self) -> dict[str, str]:
         """Starts that are typed, by name."""
         found = {}
         for word in self.others:
@@ -524,9 +552,9 @@ class _Reader:
             )
         return functions[public[0]]
 
-    def _told(self, columns: Sequence[str], reading: str) -> str:
+    def _readings_line(self, columns: Sequence[str], reading: str) -> str:
         taken = f"columns {enumerate_few(columns)}" if columns else "no column"
-        remarks = enumerate_few(self._remarks(columns, reading))
+        remarks = enumerate_few(self._text_columns_left(columns, reading))
         left_out = f"; {remarks}, without numbers, left out" if remarks else ""
         return f"Readings: column {reading} of {', '.join(self.files)}; {taken}{left_out}."
 
@@ -537,37 +565,37 @@ class _Reader:
         formula = named["formula"] if named else text
         names = parse(formula, "formula").names
         columns = [name for name in names if name in self.columns]
-        typed = self._started
-        starts = [name for name in names if name not in (*columns, *typed)]
+        typed = self._typed_starts
+        untyped = [name for name in names if name not in (*columns, *typed)]
         usual = ("y", "reading")
         if named:
             usual = (named["reading"],)
             self._refuse_other_reading(named["reading"], names)
         what = f"the formula of {', '.join(names)}"
         self._refuse_bare(names)
-        if not columns and len(self._free([])) > 1:
-            self._refuse_without_column(names, self._typed("measurement.reading") or usual)
-        reading = self._reading(what, columns, usual)
-        if not starts and not typed:
+        if not columns and len(self._columns_left([])) > 1:
+            self._refuse_without_column(names, self._last_value("measurement.reading") or usual)
+        reading = self._reading_column(what, columns, usual)
+        if not untyped and not typed:
             raise UserError(
                 f"{formula}: every name is a column of {self.files[0]}; no parameter is left"
             )
         words = ["measurement=formula", f"measurement.expression={w.quoted(formula)}"]
-        words += [f"measurement.start.{name}=1" for name in starts]
-        words += _reading_word(reading, () if "y" in columns else ("y", "reading"))
-        start = f"; start 1 for {enumerate_few(starts)}" if starts else ""
-        start += _values({name: typed[name] for name in names if name in typed})
+        words += [f"measurement.start.{name}=1" for name in untyped]
+        words += _key_for_reading(reading, () if "y" in columns else ("y", "reading"))
+        start = f"; start 1 for {enumerate_few(untyped)}" if untyped else ""
+        start += _starts_phrase({name: typed[name] for name in names if name in typed})
         parameters = [name for name in names if name not in columns]
         remedy = f"measurement.start.{parameters[0]}=X sets another"
         model = f"Model: {formula}{start}; {remedy}."
-        told = [model, self._told(columns, reading), self._noise()]
-        return self._short(words, told, self._remarks(columns, reading))
+        lines = [model, self._readings_line(columns, reading), self._noise_line()]
+        return self._short(words, lines, self._text_columns_left(columns, reading))
 
     def _refuse_other_reading(self, reading: str, names: Sequence[str]) -> None:
         """Refuses a formula whose readings are no column, or one that is used otherwise."""
         if reading not in self.columns:
             _refuse_absent(self.model, self.files[0], reading)
-        (typed,) = self._typed("measurement.reading") or [reading]
+        (typed,) = self._last_value("measurement.reading") or [reading]
         use = ""
         if reading in names:
             use = "is part of the formula, too; use it on one side alone"
@@ -582,7 +610,7 @@ class _Reader:
 
     def _refuse_without_column(self, names: Sequence[str], usual: Sequence[str]) -> NoReturn:
         """Refuses a formula of names that are no columns; one may be short for a column."""
-        free = self._free([])
+        free = self._columns_left([])
         likely = [column for column in free if column not in usual]
         short = [(name, column) for name in names for column in likely if _is_short(name, column)]
         there = f"no name in the formula is a column (there are {', '.join(self.columns)})"
@@ -629,12 +657,12 @@ class _Reader:
             words += _title("measurement", file, content)
             model = f"Model: differential equations of {file}."
             outputs = content.get("outputs", content["rates"])
-            read = [name for name in outputs if name in self._free([])]
+            read = [name for name in outputs if name in self._columns_left([])]
             if "output" in self.columns or len(read) < 2:
-                return self._short(words, [model, f"Readings: {files}.", self._noise()])
+                return self._short(words, [model, f"Readings: {files}.", self._noise_line()])
             levels = self._levels(read)
             readings = f"Readings: columns {enumerate_few(read)} of {files}."
-            return self._short([*words, *levels], [model, readings, self._noise(levels)])
+            return self._short([*words, *levels], [model, readings, self._noise_line(levels)])
         there = f"its keys are {', '.join(map(str, keys))}" if keys else "it has no keys"
         raise UserError(
             f"{file}: is no model: it has neither next: (a state model by formulas) nor rates:"
@@ -643,7 +671,7 @@ class _Reader:
 
     def _is_timed(self, content: dict[str, Any]) -> bool:
         """Tells if a state model's formulas name times that only the column time of its log has."""
-        typed = self._typed("state_model.inputs.time") or self._typed("state_model.step")
+        typed = self._last_value("state_model.inputs.time") or self._last_value("state_model.step")
         told = typed or "step" in content or "time" in content.get("inputs", {})
         clock = {"t", "dt"} & set(_names(content)) - _defined(content)
         return bool(clock) and "time" in {*self.columns} - {*self._ignored} and not told
@@ -679,6 +707,36 @@ class _Reader:
         if misnamed:
             remedy = f"its keys are {', '.join(options)}"
         raise UserError(f"{file}: {'; '.join(said)}; {remedy}")
+
+
+class _Signature(NamedTuple):
+    """Holds what the arguments of a function are: columns, or parameters with a start."""
+
+    text: str
+    """The function as it is called, such as model(t, a, b)."""
+    arguments: list[str]
+    columns: list[str]
+    """Arguments without a start."""
+    defaults: dict[str, str]
+    """Starts by the function's defaults, where none is typed."""
+    starts: dict[str, str]
+    """All starts, in the order of the arguments."""
+
+    @classmethod
+    def of(cls, function: ast.FunctionDef, typed: dict[str, str]) -> Self:
+        arguments = [one.arg for one in (*function.args.posonlyargs, *function.args.args)]
+        values = function.args.defaults
+        # Defaults belong to the last arguments.
+        first = len(arguments) - len(values)
+        columns = [name for name in arguments[:first] if name not in typed]
+        defaults = {}
+        for name, value in zip(arguments[first:], values, strict=True):
+            if name not in typed:
+                defaults[name] = ast.unparse(value)
+        known = {**defaults, **typed}
+        starts = {name: known[name] for name in arguments if known.get(name)}
+        text = f"{function.name}({', '.join(arguments)})"
+        return cls(text, arguments, columns, defaults, starts)
 
 
 def _require_entries(file: str, content: dict[str, Any], key: str) -> None:
@@ -727,11 +785,11 @@ def _is_short(name: str, column: str) -> bool:
     return long.startswith(short)
 
 
-def _reading_word(reading: str, usual: Sequence[str]) -> list[str]:
+def _key_for_reading(reading: str, usual: Sequence[str]) -> list[str]:
     return [] if reading in usual else [f"measurement.reading={w.quoted(reading)}"]
 
 
-def _values(starts: dict[str, str]) -> str:
+def _starts_phrase(starts: dict[str, str]) -> str:
     listed = ", ".join(f"{name} = {value}" for name, value in starts.items())
     return f"; start {listed}" if listed else ""
 
