@@ -1,10 +1,11 @@
 """Determines how finely each trial is integrated, by its parameters alone.
 
-A rung of the ladder is the number of equal steps between two readings. Rungs n and n/2 are compared
-(step doubling): where d is how far readings and states move between them, in shares of what they
-may, n/2 is accepted if 16 d is at most 1, and n if the error that a formula of eighth order then
-has left, 16 d / (2^8 - 1), is; else the trial climbs as far as that formula says. States are
-compared, too: a reading that saturates is the same for any state that an unstable step leaves.
+A *rung* is a number of equal steps between two readings, and a *place* its index on the ladder 1,
+2, 3, 4, 6, 8, ... Rungs n and n/2 are compared (step doubling): d is how far readings and states
+move between them, in shares of their tolerances. The error of n/2 is taken as 16 d, that of n as
+16 d / (2^8 - 1), which a formula of eighth order leaves; the coarser rung whose error is at most 1
+is accepted, and else the trial climbs as far as that formula says. States are compared, too: a
+reading that saturates is the same for any state that an unstable step leaves.
 """
 
 from __future__ import annotations
@@ -55,16 +56,19 @@ def by_rung(places: Indices, rows: Indices) -> Iterator[tuple[int, Indices]]:
 
 
 class Found(NamedTuple):
-    """Holds places on the ladder (trials,), the readings (trials, m) that the search has computed
-    there, those of the trials `computed` in their order, and whether a trial is `lost`: no rung
-    follows it; and whether it is `doubtful`: a step at its place was rough, or crossed a pole, so
-    that agreement of two rungs proves nothing."""
+    """Holds what a search found of each trial."""
 
     places: Indices
+    """Accepted places on the ladder (trials,)."""
     computed: Indices
+    """Trials whose readings the search has computed."""
     z: Array
+    """Their readings (computed, m) at their places."""
     lost: Mask
+    """Trials (trials,) that no rung follows."""
     doubtful: Mask
+    """Trials (trials,) in which a step at their place was rough, or crossed a pole: that two rungs
+    agree proves nothing of them."""
 
 
 def apart(fine: Array, coarse: Array) -> Array:
@@ -101,17 +105,18 @@ def search(
     (cases, states, times) at one rung, `unturned` shifts readings that are angles next to others,
     and `in_doubt` selects trials by their states; a row behind these is held against nothing.
     """
-    search = _Search(rungs, tolerance, states, simulate, start, unturned, in_doubt)
-    pending = computed = np.arange(len(start))
+    climb = _Climb(rungs, tolerance, states, simulate, start, unturned, in_doubt)
+    computed = np.arange(len(start))
+    pending = computed
     while len(pending):
-        climbing = []
-        for place, rows in by_rung(search.tried[pending], pending):
-            climbing.append(search.climbing(place, rows))
-        pending = np.concatenate(climbing)
-    return Found(search.found, computed, search.fine[computed], search.lost, search.doubtful)
+        unsettled = []
+        for place, rows in by_rung(climb.tried[pending], pending):
+            unsettled.append(climb.tried_at(place, rows))
+        pending = np.concatenate(unsettled)
+    return Found(climb.found, computed, climb.fine[computed], climb.lost, climb.doubtful)
 
 
-class _Search:
+class _Climb:
     """Holds what a search knows of each trial: readings and states at its rung n and at n/2."""
 
     def __init__(
@@ -131,8 +136,9 @@ class _Search:
         self.simulate = simulate
         self.unturned = unturned
         self.in_doubt = in_doubt
-        self.watched = states[1] > 0
-        """Whether there are states, of which steps may be in doubt; none where a rate is stated."""
+        # Where a model states its fastest rate, that bounds the steps: its states are held against
+        # nothing, no step is in doubt, and their arrays have no rows.
+        self.has_states = states[1] > 0
         self.tried = start.copy()
         """The place of n."""
         self.found = start.copy()
@@ -140,33 +146,35 @@ class _Search:
         self.lost = np.zeros(trials, dtype=bool)
         self.doubtful = np.zeros(trials, dtype=bool)
         self.fine = np.empty((trials, len(tolerance)))
+        """Readings at n; of a trial that is accepted, those at the place that is found."""
         self.coarse = np.empty((trials, len(tolerance)))
         self.fine_states = np.empty((trials, *states))
         self.coarse_states = np.empty((trials, *states))
         self.held = np.full(trials, -1)
-        """The place whose readings are in `fine`."""
+        """The place whose readings are in `fine`, of trials that climb on."""
 
-    def climbing(self, place: int, rows: Indices) -> Indices:
+    def tried_at(self, place: int, rows: Indices) -> Indices:
         """Tries these trials at a place, and returns those that it does not suffice for."""
         below = coarser(place)
         self._integrate(place, below, rows)
-        moved = self._moved(rows)
         # Step doubling: d bounds the error of n/2 and, by the order p = 8, d / (2^p - 1) that of n
         # (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section II.4).
-        left = moved / ((self.rungs[place] / self.rungs[below]) ** ORDER - 1.0)
-        coarse_holds = moved <= 1.0
-        fine_holds = (left <= 1.0) | (place == self.top)
+        coarse_error = self._coarse_error(rows)
+        fine_error = coarse_error / ((self.rungs[place] / self.rungs[below]) ** ORDER - 1.0)
+        coarse_holds = coarse_error <= 1.0
+        fine_holds = (fine_error <= 1.0) | (place == self.top)
         self.found[rows] = np.where(coarse_holds, below, place)
+        # These trials are done: from here on `fine` has the readings of the place that is found.
         self.fine[rows[coarse_holds]] = self.coarse[rows[coarse_holds]]
         # Where rounding shows, what finer steps move is what they leave; a stated rate promises the
         # eighth order.
-        off = moved / SAFETY if self.watched else left
+        off = coarse_error / SAFETY if self.has_states else fine_error
         self.lost[rows] = (place == self.top) & (off > NOT_FOLLOWED)
-        if self.watched:
+        if self.has_states:
             of_coarse = self.in_doubt(self.coarse_states[rows])
             of_fine = self.in_doubt(self.fine_states[rows])
             self.doubtful[rows] = np.where(coarse_holds, of_coarse, of_fine)
-        self.tried[rows] = self._next(place, left)
+        self.tried[rows] = self._next(place, fine_error)
         return rows[~(coarse_holds | fine_holds)]
 
     def _integrate(self, place: int, below: int, rows: Indices) -> None:
@@ -179,22 +187,22 @@ class _Search:
         self.simulate(rows, int(self.rungs[place]), self.fine, self.fine_states)
         self.held[rows] = place
 
-    def _moved(self, rows: Indices) -> Array:
-        """Computes how far readings and states move from n/2 to n, in shares of what they may; not
-        a number, as where an iterate overflows, is infinitely far: such a trial climbs to the top,
-        in bounded time."""
+    def _coarse_error(self, rows: Indices) -> Array:
+        """Computes 16 d, the error of n/2 in readings or in states, whichever is larger in shares
+        of its tolerance; not a number, as where an iterate overflows, is infinitely far: such a
+        trial climbs to the top, in bounded time."""
         fine = self.fine[rows]
         # The last row behind the states tells of doubts, and is none of them.
         astray = apart(self.fine_states[rows, :, :-1], self.coarse_states[rows, :, :-1])
         with np.errstate(all="ignore"):
             gaps = np.abs(fine - self.unturned(self.coarse[rows], fine))
             shifts = (gaps / self.tolerance).max(axis=1)
-            moved = SAFETY * np.maximum(shifts, astray / STATES)
-        return np.nan_to_num(moved, nan=np.inf)
+            error = SAFETY * np.maximum(shifts, astray / STATES)
+        return np.nan_to_num(error, nan=np.inf)
 
-    def _next(self, place: int, left: Array) -> Indices:
+    def _next(self, place: int, error: Array) -> Indices:
         """Returns the places to try next, one further at least. The error falls with the p-th power
-        of the step: n <- n left^(1/p)."""
-        climb = np.minimum(left ** (1.0 / ORDER), _LARGEST_CLIMB)
+        of the step: n <- n error^(1/p)."""
+        climb = np.minimum(error ** (1.0 / ORDER), _LARGEST_CLIMB)
         wanted = self.rungs[place] * climb
         return np.clip(np.searchsorted(self.rungs, wanted), place + 1, self.top)

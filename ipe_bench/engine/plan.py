@@ -23,15 +23,18 @@ from ipe_bench.engine.trace import Expression, Program
 
 @dataclass(frozen=True)
 class LinearProgram:
-    """Holds a program that is linear in a deviation and its sources, and where it finds what it
-    needs."""
+    """Holds a program J d + source of a deviation d, and where its inputs lie.
+
+    Places of the slope of a deviation are those of the first stage: stage s lies s times
+    `TangentPlan.stage_size` further on.
+    """
 
     program: Program
-    """Program of a deviation, its sources, what is saved of the state, and what is fixed."""
+    """Program from (d, sources, coefficients, fixed)."""
     sources: tuple[tuple[int, ...], ...]
-    """Places (n, sources) of the sources of each direction; of slopes, in the first stage."""
+    """Places (n, sources) of the sources of each direction."""
     saved: range
-    """Places of what is saved of the state; of slopes, in a stage that begins at 0."""
+    """Places of the coefficients in J that change along the solution."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +46,12 @@ class TangentPlan:
     motion: LinearProgram
     """Program of the slope of a deviation."""
     reading: LinearProgram
-    """Program of what it moves the readings by."""
+    """Program of the readings' deviation."""
     kept: tuple[range, ...]
-    """Places where each stage keeps what changes along the solution; what does not lies behind."""
+    """Places where each stage keeps the coefficients and sources that change along the solution;
+    the sources that do not lie behind them."""
     stage_size: int
+    """Numbers that lie in a stage."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +80,10 @@ class StepPlan:
 
     tableau: Tableau
     x: range
+    """Places of the parameters."""
     constants: range
     y: range
+    """Places of the state."""
     driven: range
     """Places of the constants that change from interval to interval, the last ones."""
     fixed: range
@@ -85,16 +92,20 @@ class StepPlan:
     begun: tuple[int, ...]
     """Places of the results of `begin`."""
     rates: Program
-    """Program from (t, y, driven, fixed) to the slope, and to what tangents need of a stage."""
+    """Program from (t, y, driven, fixed) to the slope and, for Jacobians, to the coefficients and
+    sources of deviations that a stage keeps."""
     step: Program
-    """What stages run: `rates`, and where steps are watched the side of the poles."""
+    """Program that stages run: `rates`, and where steps are watched also the side of the poles."""
     read: Program
-    """Program from the same to the readings, or to what their tangents need."""
-    left: range
+    """Program from (t, y, driven, fixed) to the readings or, for Jacobians, to the coefficients
+    and sources of their deviation."""
+    read_at: range
     """Places of the results of `read`."""
     shown: range
-    """Places of the readings, or of how they move along a direction."""
+    """Places of the readings, which are `read_at` itself, or of their deviation along a
+    direction."""
     size: int
+    """Numbers of a frame."""
     tangents: TangentPlan | None = None
     """None if readings are computed, and not Jacobians."""
     watch: WatchPlan | None = None
@@ -187,7 +198,7 @@ def _plan_readings(tape: Recording, tableau: Tableau) -> StepPlan:
         rates=Program.of(tape.slope, given),
         step=Program.of([*tape.slope, *sides], given),
         read=Program.of(tape.shown, given),
-        left=shown,
+        read_at=shown,
         shown=shown,
         size=frame.size,
         watch=watch_plan,
@@ -204,15 +215,16 @@ def _plan_jacobians(tape: Recording, tableau: Tableau) -> StepPlan:
     frame = _Frame(tape.equations)
     fixed_at = frame.room(len(fixed))
     deviations = tuple(frame.room(len(along.d)) for _ in along.dp)
+    # Stages lie one after another, each of the same size: `stage_size` leads from one to the next.
     stages = [frame.room(motion.size) for _ in range(tableau.stages)]
-    read_at = frame.room(reading.size)
+    kept_of_reading = frame.room(reading.size)
     shown = frame.room(len(along.shown))
-    # Deviations begin with their start along each parameter. What drives them and does not change
-    # along the solution lies in every stage, behind what the stage leaves, from the beginning.
     begun: Begun = [(frame.y, tape.start), (fixed_at, fixed)]
+    # A deviation begins with the start's own along each parameter.
     begun += zip(deviations, tape.along_each(along.dp, along.start), strict=True)
-    begun += [(motion.behind(stage), motion.constant_sources) for stage in stages]
-    begun.append((reading.behind(read_at), reading.constant_sources))
+    # Sources that do not change along the solution are written once, behind those that do.
+    begun += [(motion.constant_at(stage), motion.constant_sources) for stage in stages]
+    begun.append((reading.constant_at(kept_of_reading), reading.constant_sources))
     begin, places = _begin(tape, begun)
     given = [*tape.moving, *fixed]
     rates = Program.of([*tape.slope, *motion.changing], given)
@@ -228,14 +240,14 @@ def _plan_jacobians(tape: Recording, tableau: Tableau) -> StepPlan:
         rates=rates,
         step=rates,
         read=Program.of(reading.changing, given),
-        left=reading.before(read_at),
+        read_at=reading.changing_at(kept_of_reading),
         shown=shown,
         size=frame.size,
         tangents=TangentPlan(
             places=deviations,
             motion=motion.placed(stages[0], fixed),
-            reading=reading.placed(read_at, fixed),
-            kept=tuple(motion.before(stage) for stage in stages),
+            reading=reading.placed(kept_of_reading, fixed),
+            kept=tuple(motion.changing_at(stage) for stage in stages),
             stage_size=motion.size,
         ),
     )
@@ -246,11 +258,13 @@ class _Linear:
     depends on the direction of the parameters alone, and J on none."""
 
     def __init__(self, tape: Recording, along: Deviations, tangents: Sequence[Expression]) -> None:
+        # Terms in the directions alone become sources, inputs of their own.
         outputs, sources = trace.separate(tangents, along.d, along.dp)
         names = [tape.graph.input(f"source{i}") for i in range(len(sources))]
         self.sources = tape.along_each(along.dp, sources)
         """The value (n, sources) of each source along each parameter."""
         linear_in = (*along.d, *names)
+        # Coefficients of J are what enters the linear part from outside: it computes no more.
         coefficients = trace.border(outputs, trace.dependent(outputs, linear_in))
         values = [e for row in self.sources for e in row]
         varying = trace.dependent([*coefficients, *values], tape.moving)
@@ -269,11 +283,11 @@ class _Linear:
         """Numbers that are kept for a stage or a reading."""
         return len(self.changing) + len(self.constant_sources)
 
-    def before(self, at: range) -> range:
+    def changing_at(self, at: range) -> range:
         """Returns the places of what changes."""
         return at[: len(self.changing)]
 
-    def behind(self, at: range) -> range:
+    def constant_at(self, at: range) -> range:
         """Returns the places of the sources that do not change."""
         return at[len(self.changing) :]
 

@@ -165,7 +165,7 @@ class _Writer:
     def _read(self, v: Vectors, frame: Value, t: Value) -> None:
         plan = self.plan
         given = [v.spread(t), *v.load(frame, [*plan.y, *plan.driven, *plan.fixed])]
-        v.store(v.run(plan.read, given), frame, plan.left)
+        v.store(v.run(plan.read, given), frame, plan.read_at)
 
     def _move(
         self,
