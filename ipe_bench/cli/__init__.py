@@ -74,7 +74,12 @@ def places_and_keys(
     from ipe_bench.questions.question import NAMES
 
     refuse_blanks(words)
-    places = [word for word in words if "=" not in word or Path(word).is_dir()]
+    # A folder may be named after a choice, such as error_scale=10, but not after a key's value.
+    places = [
+        word
+        for word in words
+        if "=" not in word or (word.partition("=")[0] not in kinds and Path(word).is_dir())
+    ]
     found: dict[str, Any] = {}
     for word in (word for word in words if word not in places):
         key, _, text = word.partition("=")

@@ -495,15 +495,18 @@ class _Reader:
 
     def _outputs(self, chosen: ast.FunctionDef, what: str, taken: Sequence[str]) -> list[str]:
         """Finds the column of each array that a function returns in a tuple; none for one array."""
-        last = chosen.body[-1]
-        if not (isinstance(last, ast.Return) and isinstance(last.value, ast.Tuple)):
-            return []
         typed = self._last_value("measurement.outputs")
         if typed:
-            return [name.strip() for name in typed[0].strip("[]").split(",")]
-        arrays = last.value.elts
+            return listed(typed[0])
+        tuples = [one for one in _returned(chosen) if isinstance(one, ast.Tuple)]
+        if not tuples:
+            return []
+        arrays = tuples[-1].elts
         free = [name for name in self._columns_left(taken) if not name.startswith(f"{SIGMA}_")]
-        named = [one.id if isinstance(one, ast.Name) else "" for one in arrays]
+        alike = [_names_of(one) for one in tuples if len(one.elts) == len(arrays)]
+        meanings = [{*names} & {*free} for names in zip(*alike, strict=True)]
+        named = ["".join(names) if len(names) == 1 else "" for names in meanings]
+        certain = all(len(names) < 2 for names in meanings)
         if {*named} <= {*free}:
             unused = [name for name in free if name not in named]
             if unused:
@@ -511,7 +514,7 @@ class _Reader:
             return named
         rest = (name for name in free if name not in named)
         meant = [name if name in free else next(rest, "NAME") for name in named]
-        if len(free) == len(arrays) and meant == free:
+        if len(free) == len(arrays) and meant == free and certain:
             return free
         example = ",".join(meant)
         raise UserError(
@@ -777,6 +780,24 @@ def _title(group: str, file: str, content: dict[str, Any]) -> list[str]:
     if "title" in content or not _BARE_TITLE.fullmatch(stem):
         return []
     return [f"{group}.title={stem}"]
+
+
+def _returned(function: ast.FunctionDef) -> list[ast.expr | None]:
+    """Lists what a function returns, without the functions inside of it."""
+    found = []
+    nodes: list[ast.AST] = [*function.body]
+    while nodes:
+        node = nodes.pop(0)
+        if isinstance(node, ast.Return):
+            found.append(node.value)
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            nodes += ast.iter_child_nodes(node)
+    return found
+
+
+def _names_of(arrays: ast.Tuple) -> list[str]:
+    """Lists the names of arrays that are returned, empty of those without one."""
+    return [one.id if isinstance(one, ast.Name) else "" for one in arrays.elts]
 
 
 def _is_short(name: str, column: str) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import shorts
+from ipe_bench.cli import places_and_keys, shorts
 from ipe_bench.cli.single import single
 
 T = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0])
@@ -40,6 +40,11 @@ FILES = {
     "many.py": "def law(t, k=1.0):\n    y = k * t\n    return k + t, y\n",
     "crossed.py": "def law(t, k=1.0):\n    y, left = k * t, k + t\n    return y, left\n",
     "named.py": "def law(t, k=1.0):\n    x, y = k + t, k * t\n    return y, x\n",
+    "branched.py": "def law(t, k=1.0):\n    def half(t):\n        return t, t, t\n\n"
+    "    x, y = k + t, k * t\n    if k > 9:\n        return t, t\n    else:\n        return y, x\n",
+    "swapped.py": "def law(t, k=1.0):\n    x, y = k + t, k * t\n"
+    "    if k > 9:\n        return y, x\n    return x, y\n",
+    "kept.py": "def law(t, k=1.0):\n    both = k * t, k + t\n    return both\n",
     "pairs.csv": "t,x,y\n1,1.1,1.6\n2,1.2,1.3\n3,1.3,1.1\n",
     "three.csv": "t,x,y,z\n1,1.1,1.6,1\n2,1.2,1.3,1\n3,1.3,1.1,1\n",
     "pair.yaml": "rates: {x: a*x, y: -b*y}\nstart: {a: 0.1, b: 0.2}\ninitial: {x: 1, y: 2}\n",
@@ -453,3 +458,30 @@ def test_no_other_column_is_read_than_the_one_that_a_formula_names(
     with pytest.raises(UserError) as caught:
         shorts.read("estimate", words)
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "outputs"),
+    [
+        (["branched.py", "pairs.csv"], "['y','x']"),
+        (["kept.py", "pairs.csv", "measurement.outputs=[y,x]"], "['y','x']"),
+    ],
+)
+def test_arrays_that_a_function_returns_somewhere_have_their_columns(
+    words: list[str], outputs: str
+) -> None:
+    assert f"measurement.outputs={outputs}" in shorts.read("estimate", words).words
+
+
+def test_arrays_in_two_orders_are_refused() -> None:
+    with pytest.raises(UserError, match="name theirs in order"):
+        shorts.read("estimate", ["swapped.py", "pairs.csv"])
+
+
+def test_a_folder_does_not_hide_a_key(folder: Path) -> None:
+    for name in ("level=0.9", "error_scale=10"):
+        (folder / name).mkdir()
+    words = ["error_scale=10", "level=0.9"]
+    found = places_and_keys("compare", words, {"level": float})
+    assert found == (["error_scale=10"], {"level": 0.9})
+    assert places_and_keys("compare", ["./level=0.9"], {"level": float})[0] == ["./level=0.9"]
