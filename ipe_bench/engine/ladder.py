@@ -113,7 +113,7 @@ def search(
         for place, rows in by_rung(climb.tried[pending], pending):
             unsettled.append(climb.tried_at(place, rows))
         pending = np.concatenate(unsettled)
-    return Found(climb.found, computed, climb.fine[computed], climb.lost, climb.doubtful)
+    return Found(climb.found, computed, climb.fine, climb.lost, climb.doubtful)
 
 
 class _Climb:
