@@ -171,8 +171,8 @@ CHANGES = {
     "ekf-alone": Change(
         "states",
         "lm_ieks begins at the EKF alone",
-        "for rule in (Taylor(), Unscented())",
-        "for rule in (Taylor(), Taylor())",
+        "other = Descent.of(density, passed(model, z, Unscented())[0])",
+        "other = first",
         "test_paths.py",
     ),
     "recorded-unheld": Change(
@@ -276,7 +276,7 @@ CHANGES = {
     "periodic-state": Change(
         "states",
         "a periodic state is not followed next to its path",
-        "state = State(near(state.x, here, self.state_periods), state.F)",
+        "state = State(near(state.x, path_here.x, self.state_periods), state.F)",
         "state = State(state.x, state.F)",
         "test_paths.py",
     ),
@@ -368,8 +368,8 @@ CHANGES = {
     "safety-forgotten": Change(
         "engine",
         "the estimate of an integration error is believed to the last digit",
-        "moved = SAFETY * np.maximum(shifts, astray / STATES)",
-        "moved = np.maximum(shifts, astray / STATES)",
+        "error = SAFETY * np.maximum(shifts, astray / STATES)",
+        "error = np.maximum(shifts, astray / STATES)",
         "test_ode_integrator.py test_ode_paths.py test_gins.py",
     ),
     "states-unseen": Change(
@@ -565,8 +565,8 @@ CHANGES = {
     "candidates-once": Change(
         "solvers",
         "of several candidates of a trial one alone is paid for",
-        "np.add.at(total, owner, getattr(tally, name) - total[owner])",
-        "total[owner] += getattr(tally, name) - total[owner]",
+        "np.add.at(total, owner, spent)",
+        "total[owner] += spent",
         "test_costs.py test_auto.py",
     ),
     "beta-is-kappa": Change(
@@ -621,7 +621,7 @@ CHANGES = {
     "iterated-once": Change(
         "states",
         "an iterated filter linearises at the prediction again",
-        "linear = law(h, state, found.state)",
+        "linear = law(h, state, update.state)",
         "linear = law(h, state, state)",
         "test_trackers.py test_likelihood.py test_logs.py",
     ),
@@ -948,7 +948,7 @@ CHANGES = {
     "start-of-first": Change(
         "states",
         "the likelier smoother has the start of the other",
-        "mine[rows] = its[likelier]",
+        "smooth.start.mean[rows] = unscented.start.mean[likelier]",
         "pass",
         "test_auto_tracker.py",
     ),
