@@ -218,3 +218,15 @@ def test_parameters_of_which_outputs_are_constant_in_pieces_are_named(shown, nam
     model = Ode({"y": "-k*y"}, {"k": 0.5, "q": 3.3}, {"y": "1"}, {"z": shown}, (1.0, 2.0, 3.0, 4.0))
     said = [text.partition(", but")[0] for text in model.remarks(model.nominal)]
     assert said == ([f"readings do not change with small changes of {named}"] if named else [])
+
+
+def test_readings_that_begin_at_a_year_are_refused_and_those_from_a_start_are_not(tmp_path):
+    model = Ode({"y": "-k*y"}, {"k": 0.5}, {"y": 3.0})
+    path = tmp_path / "years.csv"
+    path.write_text("time,reading\n1900,2\n1901,1.5\n1905,1\n")
+    with pytest.raises(UserError, match=r"begin at 1900 and last 5, .*; subtract 1900 from the"):
+        open_together([path], model)
+    path.write_text("time,reading\n0,\n1900,2\n1901,1.5\n1905,1\n")
+    assert np.isfinite(open_together([path], model).z).sum() == 3
+    path.write_text("time,reading\n90,2\n95,1.5\n100,1\n")
+    assert len(open_together([path], model).z) == 3
