@@ -61,9 +61,13 @@ _MOST_OUTLIERS = 5
 _MOST_GATED_SHOWN = 10
 _HARDLY = 0.1
 """Weight below which a reading hardly counts."""
+_LEAST_LOST = 4
+"""Epochs beyond the gate, or all, from which on a track may be lost."""
 _FEW = 3
 _SHARE = 0.05
 """Share of outliers above which the model is wrong, and no list of epochs helps."""
+_MOST_OUTLYING = 0.2
+"""Share of outliers above which no gate helps either."""
 _COLLAPSED = 2.0
 """Effective sample sizes below this have no covariance."""
 _TURNS = {"deg": 360.0, "°": 360.0, "rad": 2 * np.pi}
@@ -467,12 +471,13 @@ def _judged_innovations(log: Log, tracker: Tracker, innovations: Array) -> Array
 
 def _lost_from(nis: Array, degrees: Array) -> int | None:
     """Finds the first epoch, from 1 on, whose NIS (K,) lies beyond the gate, and from which on most
-    do; None without one."""
+    do, and some; None without one."""
     at = np.flatnonzero(np.isfinite(nis))
     beyond = chdtrc(degrees[at], nis[at]) < GATE
     following = np.cumsum(beyond[::-1])[::-1]
     share = following / np.arange(len(at), 0, -1)
-    lost = at[beyond & (share > 0.5)]
+    # An outlier at the end of a log is no loss.
+    lost = at[beyond & (share > 0.5) & (following >= min(_LEAST_LOST, len(at)))]
     return int(lost[0]) + 1 if len(lost) else None
 
 
@@ -520,18 +525,24 @@ def _left_out(log: Log, out: Mask | None, what: str) -> list[str]:
 
 def _worst(log: Log, nis: Array, degrees: Array, lost_from: int | None) -> list[str]:
     """Words the epochs whose NIS (K,) is so large that chance has one in a whole log with a
-    probability of 1 %, the worst first; none if the track is lost or they are many."""
+    probability of 1 %, the worst first, or how many they are; none if the track is lost."""
     at = np.flatnonzero(np.isfinite(nis))
     beyond = at[chdtrc(degrees[at], nis[at]) < OUTLIER_LEVEL / max(len(at), 1)]
-    if lost_from is not None or not 0 < len(beyond) <= max(_FEW, _SHARE * len(at)):
+    few = max(_FEW, _SHARE * len(at))
+    if lost_from is not None or not 0 < len(beyond) <= max(few, _MOST_OUTLYING * len(at)):
         return []
+    if len(beyond) > few:
+        return [
+            f"{len(beyond)} of {len(at)} time steps are further from their predictions than chance"
+            " explains; if these are outliers, gate=0.999 leaves them out"
+        ]
     listed = sorted(beyond, key=lambda k: -nis[k])[:_MOST_OUTLIERS]
     epochs = ", ".join(f"{k + 1} (NIS {nis[k]:.3g})" for k in listed)
     further = len(beyond) - len(listed)
     others = f" and {further} more" if further else ""
     return [
         f"outliers, whose readings are further from their predictions than chance explains:"
-        f" time steps {epochs}{others}; empty a cell to leave its reading out"
+        f" time steps {epochs}{others}; empty a cell to leave its reading out, as gate=0.999 does"
     ]
 
 

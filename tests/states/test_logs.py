@@ -18,6 +18,7 @@ import ipe_bench as ib
 from ipe_bench.measurements import Parameter
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import options
+from ipe_bench.real import logs
 from ipe_bench.report.page.log import write_page
 from ipe_bench.states import Bootstrap, Formulas, IteratedSmoother, Smoother, ckf, ekf, ukf
 from ipe_bench.states.damped import LevenbergMarquardtSmoother
@@ -564,3 +565,12 @@ def test_status_says_what_a_folder_of_an_estimate_has(ipe_bench, tmp_path):
     (tmp_path / "out" / "track.json").write_text('{"command": {}, "readings": [3]}')
     code, _, err = ipe_bench("status", "out")
     assert (code, "contains no results of ipe-bench" in err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("outliers", "lost"), [([39], None), ([38, 39], None), ([*range(30, 40)], 31)]
+)
+def test_outliers_at_the_end_of_a_log_are_no_lost_track(outliers, lost):
+    nis = np.ones(40)
+    nis[outliers] = 60.0
+    assert logs._lost_from(nis, np.ones(40)) == lost
