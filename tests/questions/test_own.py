@@ -255,7 +255,7 @@ def test_the_command_writes_what_it_says(ipe_bench: Any, tmp_path: Path) -> None
     said = out.split("Readings:")[1]
     assert "On 20 simulated data sets like yours: take" in said
     folder = tmp_path / "outputs/run-formula"
-    assert (folder / "own.csv").read_text().startswith("truth,estimator,told,ranked,trials,finds")
+    assert (folder / "own.csv").read_text().startswith("truth,estimator,prior,ranked,trials,finds")
     assert "On 20 simulated data sets like yours: take" in (folder / "own.html").read_text()
 
 
