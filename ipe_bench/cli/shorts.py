@@ -423,18 +423,20 @@ class _Reader:
             f" needed: {self._again(self._ignoring(unused))}"
         )
 
+    @property
+    def _noise_stated(self) -> bool:
+        return any(word.startswith("noise") for word in self.others)
+
     def _levels(self, read: Sequence[str]) -> list[str]:
         """Returns the words by which each of several columns of readings has a noise level of its
         own, unless noise is stated."""
-        stated = any(word.startswith("noise") for word in self.others)
-        if stated or not {SIGMA, f"{SIGMA}_{read[0]}"}.isdisjoint(self.columns):
+        if self._noise_stated or not {SIGMA, f"{SIGMA}_{read[0]}"}.isdisjoint(self.columns):
             return []
         return ["noise=unknown", "noise.by=output"]
 
     def _noise_line(self, levels: Sequence[str] = ()) -> str:
         """Says what is taken for the noise of an estimate; other commands say it with its size."""
-        stated = any(word.startswith("noise") for word in self.others)
-        if stated or self.command != "estimate":
+        if self._noise_stated or self.command != "estimate":
             return ""
         if levels:
             return "Noise: a level for each of these columns, estimated from its residuals."

@@ -426,7 +426,6 @@ def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
 def _readings_in(table: TextTable, model: Measurement) -> Readings:
     """Reads a file, which may have too few readings."""
     given = table
-    headings = list(table.heading)
     table = _stacked(table, model)
     sigma = table.find(SIGMA)
     columns = {wanted: table.find(wanted.heading) for wanted in model.inputs}
@@ -439,7 +438,7 @@ def _readings_in(table: TextTable, model: Measurement) -> Readings:
     for wanted, column in columns.items():
         if column is None and wanted.default is None:
             table.refuse_other_unit(wanted.heading)
-            absent = model.absent_input(wanted.heading, headings)
+            absent = model.absent_input(wanted.heading, list(given.heading))
             raise table.error(f"column {wanted.heading} is missing; {absent}")
     if not table.rows:
         raise table.error("has a header and no rows")
