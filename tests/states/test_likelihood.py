@@ -294,7 +294,7 @@ def test_a_log_without_noise_has_none():
             lambda u: (
                 dense_log_likelihood(0.8, 0.0, 1.0, x)
                 - dense_log_likelihood(0.8, u, 1.0, x)
-                - norm.ppf(0.95) ** 2 / 2
+                - norm.ppf(0.975) ** 2 / 2
             ),
             0.01,
             2.0,
