@@ -204,6 +204,10 @@ def test_rates_in_pieces_of_time_have_their_exact_solution(method, dose):
         ("-k*y*sign(y - 0.5)", "a rate jumps at a moment"),
         ("k if y**3 < 1e15 else 3*k", "a rate jumps at a moment"),
         ("k*y if exp(y) < 1e10 else -k", "a rate jumps at a moment"),
+        ("k if exp(y) > 1e100 else 2*k", "a rate jumps at a moment"),
+        ("k if 1/y > 1e5 else 3*k", "a rate jumps at a moment"),
+        ("k if log10(y) < -7 else 2*k", "a rate jumps at a moment"),
+        ("1e-12*k*y if y < 1e-9 else 1e-12", "a rate jumps at a moment"),
         (
             "-k*y*floor(t)",
             "a rate jumps at a moment.*write comparisons of t where floor or mod is taken",
@@ -226,7 +230,16 @@ def test_a_jump_at_an_unknown_moment_is_refused(rate, message, method):
 
 @pytest.mark.parametrize(
     "rate",
-    ["k*min(y**3, 1e15)", "k*min(exp(y), 1e10)", "k*max(exp(y) - 1e10, 0)", "k*sqrt(abs(y - 1e6))"],
+    [
+        "k*min(y**3, 1e15)",
+        "k*min(exp(y), 1e100)",
+        "k*max(exp(y) - 1e10, 0)",
+        "k*sqrt(abs(y - 1e6))",
+        "k*min(1/y, 1e5)",
+        "k*abs(sin(y))",
+        "1e-9*k*max(y - 1e-6, 0)",
+        "k*((1-exp(-y))/y if abs(y) > 1e-8 else 1)",
+    ],
 )
 def test_a_kink_is_no_jump_however_large_the_numbers_are_that_meet_in_it(rate):
     model = Ode({"y": rate}, {"k": 0.3}, {"y": 1.0}, times=(0.1, 0.2))
