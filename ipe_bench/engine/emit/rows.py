@@ -1,66 +1,102 @@
-"""Writes recorded functions of rows of numbers, one row after another."""
+"""Writes recorded functions of rows of numbers: a loop over the rows, one row at a time.
+
+The values of a row are computed as single numbers, vectors of one lane. Its slopes are computed
+several columns at a time: a lane follows the tangent along one of the numbers x_j, whose direction
+is row j of the unit matrix.
+"""
 
 from __future__ import annotations
 
-from typing import Any
-
 from llvmlite import ir
 
-from ipe_bench.engine.emit.vectors import F64, I32, I64, PTR, VOID, Vectors, integer, loop, put
+from ipe_bench.engine.emit.vectors import (
+    I64,
+    PTR,
+    Value,
+    Vectors,
+    integer,
+    is_given,
+    loop,
+    opened,
+    put,
+    row_of,
+    smaller,
+)
 from ipe_bench.engine.trace import Program, RowPrograms
 
 
 def rates(program: Program, width: int) -> str:
-    """Writes void rates(double *x, double *si, double *out, int64 trials): one number from the
-    parameters x[i] times si, for one trial at a time, a width of 1."""
-    kinds = ir.FunctionType(VOID, [PTR, PTR, PTR, I64])
-    made: Any = ir.Function(ir.Module("rates"), kinds, "rates")
-    x, si, out, trials = made.args
-    b: Any = ir.IRBuilder(made.append_basic_block())
+    """Writes a program of n parameters and one result, the rate of a trial.
+
+        void rates(double *x, double *si, double *out, int64 trials)
+
+    computes out (trials,) of the rows x (trials, n), each number times its size in si (n,). The
+    width is 1: a trial at a time.
+    """
+    module = ir.Module("rates")
+    b = opened(module, "rates", [PTR, PTR, PTR, I64])
+    x, si, out, trials = b.function.args
+    v = Vectors(b, width)
     n = program.inputs
-    # for i in range(trials): out[i] = rate(x[i] * si)
-    with loop(b, integer(0), trials) as i:
-        v = Vectors(b, width)
-        row = v.load(v.place(x, b.mul(i, integer(n))), range(n))
+    with loop(b, 0, trials) as i:
+        row = v.load(row_of(b, x, i, n), range(n))
         sizes = v.load(si, range(n))
-        given = [b.fmul(value, size) for value, size in zip(row, sizes, strict=True)]
-        (rate,) = v.run(program, given)
+        parameters = [b.fmul(number, size) for number, size in zip(row, sizes, strict=True)]
+        (rate,) = v.run(program, parameters)
         put(b, rate, out, i)
     b.ret_void()
-    return str(made.module)
+    return str(module)
 
 
 def rows(source: RowPrograms, width: int) -> str:
-    """Writes void rows(double *x, double *c, int64 count, double *unit, double *y, double *J, int64
-    total): for each row i of x (total, n), with row i % count of the numbers c, the values y
-    (total, m) and, unless J is null, their slopes J (total, m, n). A vector holds tangents in
-    `width` directions, of the unit matrix (n, n)."""
-    kinds = ir.FunctionType(VOID, [PTR, PTR, I64, PTR, PTR, PTR, I64])
-    made: Any = ir.Function(ir.Module("rows"), kinds, "rows")
-    x, c, count, unit, y, J, total = made.args
-    b: Any = ir.IRBuilder(made.append_basic_block())
+    """Writes a function y(x, c) of rows, m values of n numbers x and p numbers c, with its slopes.
+
+        void rows(double *x, double *c, int64 count, double *unit, double *y, double *J,
+                  int64 total)
+
+    computes, of each row i of x (total, n) and row i % count of c (count, p), the values y
+    (total, m) and, unless J is null, the slopes dy/dx, J (total, m, n). `unit` is the unit matrix
+    (n, n), and the width at most n.
+    """
+    module = ir.Module("rows")
+    b = opened(module, "rows", [PTR, PTR, I64, PTR, PTR, PTR, I64])
+    x, c, count, unit, y, J, total = b.function.args
     v = Vectors(b, 1)
-    w = Vectors(b, width)
     n = source.n
     m = source.m
-    numbers = source.values.inputs - n
-    asked = b.icmp_signed("!=", b.ptrtoint(J, I64), integer(0))
-    last = integer(n - width)
-    with loop(b, integer(0), total) as i:
-        known = v.place(c, b.mul(b.urem(i, count), integer(numbers)))
-        # y[i] = y(x[i], c[i % count]), and what its tangents need of it.
-        given = v.load(v.place(x, b.mul(i, integer(n))), range(n))
-        found = v.run(source.values, [*given, *v.load(known, range(numbers))])
-        v.store(found[:m], v.place(y, b.mul(i, integer(m))), range(m))
-        # J[i] = dy/dx, `width` columns at a time: a vector holds a tangent in that many directions.
-        with b.if_then(asked), loop(b, integer(0), integer(n), width) as begun:
-            saved = [w.spread(b.extract_element(a, ir.Constant(I32, 0))) for a in found[m:]]
-            # The last vector begins early enough to end with the last direction.
-            first = b.select(b.icmp_signed("<", begun, last), begun, last)
-            here = b.gep(unit, [first], source_etype=F64)
-            to = b.gep(J, [b.add(b.mul(i, integer(m * n)), first)], source_etype=F64)
-            along = [w.load_at(here, integer(j * n)) for j in range(n)]
-            for j, value in enumerate(w.run(source.tangents, [*along, *saved])):
-                w.store_at(value, to, integer(j * n))
+    p = source.values.inputs - n
+    slopes_wanted = is_given(b, J)
+    with loop(b, 0, total) as i:
+        numbers = v.load(row_of(b, x, i, n), range(n))
+        repeated = b.urem(i, count)
+        constants = v.load(row_of(b, c, repeated, p), range(p))
+        results = v.run(source.values, [*numbers, *constants])
+        values = results[:m]
+        v.store(values, row_of(b, y, i, m), range(m))
+        with b.if_then(slopes_wanted):
+            # Behind the values stands what the tangents need of them.
+            held = [v.lane(result, 0) for result in results[m:]]
+            slopes = row_of(b, J, i, m * n)
+            _write_slopes(Vectors(b, width), source, held, unit, slopes)
     b.ret_void()
-    return str(made.module)
+    return str(module)
+
+
+def _write_slopes(
+    v: Vectors, source: RowPrograms, held: list[Value], unit: Value, J: Value
+) -> None:
+    """Writes the slopes J (m, n) of one row, `width` columns at a time, from the numbers of its
+    values that are `held`."""
+    b = v.builder
+    n = source.n
+    last = integer(n - v.width)
+    with loop(b, 0, n, v.width) as column:
+        # Where fewer columns than lanes are left, the vector begins earlier, to end with the last
+        # column: some columns are computed twice, and none beyond the row.
+        first = smaller(b, column, last)
+        rows_of_unit = [b.add(first, integer(j * n)) for j in range(n)]
+        directions = [v.load_at(unit, place) for place in rows_of_unit]
+        spread = [v.spread(number) for number in held]
+        slopes = v.run(source.tangents, [*directions, *spread])
+        for i, slope in enumerate(slopes):
+            v.store_at(slope, J, b.add(first, integer(i * n)))

@@ -31,8 +31,8 @@ class Vectors:
         self.type = ir.VectorType(F64, width)
 
     def place(self, frame: Value, index: int | Value) -> Value:
-        index = integer(index) if isinstance(index, int) else index
-        return self.builder.gep(frame, [index], source_etype=self.type)
+        """Returns the pointer to one vector of a frame."""
+        return self.builder.gep(frame, [integer(index)], source_etype=self.type)
 
     def load(self, frame: Value, places: Iterable[int | Value]) -> list[Value]:
         return [
@@ -44,13 +44,24 @@ class Vectors:
         for value, i in zip(values, places, strict=True):
             self.builder.store(value, self.place(frame, i), align=8 * self.width)
 
-    def load_at(self, array: Value, index: Value) -> Value:
+    def load_at(self, array: Value, index: int | Value) -> Value:
         """Loads numbers that lie side by side anywhere."""
-        place = self.builder.gep(array, [index], source_etype=F64)
-        return self.builder.load(place, typ=self.type, align=8)
+        return self.builder.load(_entry(self.builder, array, index), typ=self.type, align=8)
 
-    def store_at(self, value: Value, array: Value, index: Value) -> None:
-        self.builder.store(value, self.builder.gep(array, [index], source_etype=F64), align=8)
+    def store_at(self, value: Value, array: Value, index: int | Value) -> None:
+        """Stores numbers side by side anywhere."""
+        self.builder.store(value, _entry(self.builder, array, index), align=8)
+
+    def lane(self, vector: Value, place: int) -> Value:
+        """Returns the number in one lane."""
+        return self.builder.extract_element(vector, ir.Constant(I32, place))
+
+    def gathered(self, numbers: Iterable[Value]) -> Value:
+        """Makes a vector of a number for each lane."""
+        vector = ir.Constant(self.type, ir.Undefined)
+        for place, number in enumerate(numbers):
+            vector = self.builder.insert_element(vector, number, ir.Constant(I32, place))
+        return vector
 
     def turned(self, square: list[Value]) -> list[Value]:
         """Makes columns of the rows of a square matrix, by blocks of 1, 2, 4 numbers."""
@@ -84,16 +95,16 @@ class Vectors:
         )
 
     def run(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
+        """Writes a recorded program, and returns its outputs."""
         values = list(inputs)
         assert len(values) == program.inputs
         # Values are numbered as in the program: inputs, then the result of each operation.
         for name, *numbers in program.operations:
-            constant = name == "constant"
-            values.append(
-                self.constant(*numbers)
-                if constant
-                else self.apply(name, *[values[i] for i in numbers])
-            )
+            if name == "constant":
+                made = self.constant(*numbers)
+            else:
+                made = self.apply(name, *[values[i] for i in numbers])
+            values.append(made)
         return [values[i] for i in program.outputs]
 
     def combine(
@@ -155,13 +166,8 @@ class Vectors:
     def _each(self, name: str, *args: Value) -> Value:
         """Calls a function of the C library, lane by lane."""
         function = self._declared(name, F64, len(args))
-        result = ir.Constant(self.type, ir.Undefined)
-        for lane in (ir.Constant(I32, i) for i in range(self.width)):
-            number = self.builder.call(
-                function, [self.builder.extract_element(a, lane) for a in args]
-            )
-            result = self.builder.insert_element(result, number, lane)
-        return result
+        lanes = ([self.lane(a, i) for a in args] for i in range(self.width))
+        return self.gathered(self.builder.call(function, numbers) for numbers in lanes)
 
     def _declared(self, name: str, kind: ir.Type, count: int) -> ir.Function:
         module = self.builder.module
@@ -171,7 +177,7 @@ class Vectors:
 
 
 @contextmanager
-def loop(b: ir.IRBuilder, first: Value, last: Value, by: int = 1) -> Iterator[Value]:
+def loop(b: ir.IRBuilder, first: int | Value, last: int | Value, by: int = 1) -> Iterator[Value]:
     """Writes a loop for i in range(first, last, by)."""
     test = b.append_basic_block("test")
     body = b.append_basic_block("body")
@@ -181,8 +187,8 @@ def loop(b: ir.IRBuilder, first: Value, last: Value, by: int = 1) -> Iterator[Va
     b.position_at_end(test)
     # i is `first` on the way in, and i + by on the way round.
     i = b.phi(I64)
-    i.add_incoming(first, before)
-    b.cbranch(b.icmp_signed("<", i, last), body, after)
+    i.add_incoming(integer(first), before)
+    b.cbranch(b.icmp_signed("<", i, integer(last)), body, after)
     b.position_at_end(body)
     yield i
     i.add_incoming(b.add(i, integer(by)), b.block)
@@ -190,16 +196,43 @@ def loop(b: ir.IRBuilder, first: Value, last: Value, by: int = 1) -> Iterator[Va
     b.position_at_end(after)
 
 
-def integer(value: int) -> Value:
-    return ir.Constant(I64, value)
+def opened(module: ir.Module, name: str, kinds: Sequence[ir.Type]) -> Any:
+    """Begins a function without a result; returns its builder, whose `function` has the `args`."""
+    function = ir.Function(module, ir.FunctionType(VOID, kinds), name)
+    return ir.IRBuilder(function.append_basic_block())
 
 
-def number_at(b: ir.IRBuilder, array: Value, index: Value, kind: ir.Type = F64) -> Value:
-    return b.load(b.gep(array, [index], source_etype=kind), typ=kind)
+def integer(value: int | Value) -> Value:
+    """Returns a whole number as a value, which it may be already."""
+    return ir.Constant(I64, value) if isinstance(value, int) else value
+
+
+def smaller(b: ir.IRBuilder, one: Value, other: Value) -> Value:
+    """Writes the smaller of two whole numbers."""
+    return b.select(b.icmp_signed("<", one, other), one, other)
+
+
+def is_given(b: ir.IRBuilder, pointer: Value) -> Value:
+    """Writes whether a pointer is not null."""
+    return b.icmp_signed("!=", b.ptrtoint(pointer, I64), integer(0))
+
+
+def row_of(b: ir.IRBuilder, array: Value, index: Value, size: int | Value) -> Value:
+    """Returns the pointer to a row of an array of numbers, each row `size` numbers long."""
+    return _entry(b, array, b.mul(index, integer(size)))
+
+
+def number_at(b: ir.IRBuilder, array: Value, index: int | Value, kind: ir.Type = F64) -> Value:
+    return b.load(_entry(b, array, index, kind), typ=kind)
 
 
 def put(b: ir.IRBuilder, value: Value, array: Value, index: Value) -> None:
-    b.store(value, b.gep(array, [index], source_etype=value.type))
+    b.store(value, _entry(b, array, index, value.type))
+
+
+def _entry(b: ir.IRBuilder, array: Value, index: int | Value, kind: ir.Type = F64) -> Value:
+    """Returns the pointer to one entry of an array."""
+    return b.gep(array, [integer(index)], source_etype=kind)
 
 
 def room(b: ir.IRBuilder, kind: ir.Type, count: int = 1, align: int = 8) -> Value:
