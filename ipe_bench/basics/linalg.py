@@ -123,6 +123,12 @@ def _of_each(function: Callable[..., Array], *batches: Array) -> Array:
         return made
 
 
+def diagonal(A: Array) -> Array:
+    """Returns a view (trials, n) of the diagonals of matrices (trials, n, n), to be written
+    into."""
+    return np.einsum("tii->ti", A)
+
+
 def deviations(P: Array) -> Array:
     """Returns the standard deviations (trials, n) of the covariances P (trials, n, n)."""
     return np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
@@ -244,7 +250,9 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
         size = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
         scaled = G / (size[:, :, None] * size[:, None, :])
         usable = finite(scaled)
-        unit = np.where(usable[:, None, None], scaled, np.eye(n))
+        unit = scaled
+        if not usable.all():
+            unit = np.where(usable[:, None, None], scaled, np.eye(n))
         L = _of_each(np.linalg.cholesky, unit)
         U = L.swapaxes(1, 2)
         inverse_U = _inverse_of_upper(U)
@@ -257,11 +265,12 @@ def _inverse_of_upper(U: Array) -> Array:
     """Inverts upper triangular matrices (trials, n, n), by back substitution in all trials at
     once."""
     V = np.zeros(U.shape)
-    for i in reversed(range(U.shape[1])):
+    pivots = np.diagonal(U, axis1=1, axis2=2)
+    diagonal(V)[...] = 1.0 / pivots
+    for i in reversed(range(U.shape[1] - 1)):
         after = slice(i + 1, None)
-        V[:, i] = -np.matmul(U[:, i, None, after], V[:, after])[:, 0]
-        V[:, i, i] += 1.0
-        V[:, i] /= U[:, i, i, None]
+        row = np.matmul(U[:, i, None, after], V[:, after])[:, 0]
+        V[:, i, after] = row[:, after] / -pivots[:, i, None]
     return V
 
 

@@ -153,7 +153,7 @@ def iterate(equations: E, method: Method[E, S], start: Array | S, limits: Limits
         )
         now = np.full(len(active), Status.RUNNING, np.int8)
         for holds, ending in reversed(endings):
-            if np.any(holds):
+            if np.count_nonzero(holds):
                 now = np.where(holds, ending, now)
         status[active] = now
         going = now == Status.RUNNING

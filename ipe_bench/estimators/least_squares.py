@@ -16,6 +16,7 @@ from ipe_bench.basics.linalg import (
     Covariance,
     Mask,
     definite_factor,
+    diagonal,
     divisors,
     finite,
     finite_or,
@@ -162,10 +163,11 @@ class NormalEquations:
         """Computes the step that minimises |r + J s|^2 + |weights s|^2, and its predicted decrease
         of |r + J s|^2."""
         # An overflowing damping is treated by the other way.
-        with np.errstate(over="ignore"):
-            damping = weights[:, :, None] ** 2 * np.eye(self.U.shape[1])
         U_transposed = self.U.swapaxes(1, 2)
-        _, root, well = definite_factor(np.matmul(U_transposed, self.U) + damping)
+        damped = np.matmul(U_transposed, self.U)
+        with np.errstate(over="ignore"):
+            diagonal(damped)[...] += weights**2
+        _, root, well = definite_factor(damped)
         # (U'U + D^2) s = -U'g, where the inverse of the matrix on the left is root root'.
         uphill = multiply(U_transposed, self.gradient)
         step = -multiply(root, multiply(root.swapaxes(1, 2), uphill))

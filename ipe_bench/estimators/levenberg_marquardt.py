@@ -182,6 +182,6 @@ class LevenbergMarquardtMethod(Method[Objective, LeastSquaresSystem]):
 def _damping_factor(gain: Array, believed: Array) -> Array:
     """Computes Nielsen's factor (trials,) of lambda, max(1/3, 1 - (2 gain - 1)^3): below 1 where
     the decrease is more than half of what was predicted, and the step is `believed`."""
-    excess = 2 * np.clip(gain, 0, 1) - 1
+    excess = 2 * np.minimum(np.maximum(gain, 0), 1) - 1
     factor = np.maximum(1 / 3, 1 - excess**3)
     return np.where(believed, factor, np.maximum(factor, 1.0))

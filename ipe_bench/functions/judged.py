@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -64,8 +65,9 @@ def by_complex_steps(h: Rows, x: Array) -> Array:
     parts: list[Array] = []
     begun = 0
     few = 1
+    steps = np.eye(n) * _COMPLEX_STEP * 1j
     while begun < rows or not parts:
-        points = x[begun : begun + few, None, :] + np.eye(n) * _COMPLEX_STEP * 1j
+        points = x[begun : begun + few, None, :] + steps
         moved = np.imag(h(read_only(points.reshape(-1, n))))
         parts.append(moved.reshape(len(points), n, moved.shape[-1]).swapaxes(1, 2))
         begun += few
@@ -103,9 +105,7 @@ class Judged:
             J = self._by_complex_steps(x)
         except Exception:  # functions of `math` and many of SciPy take no complex numbers
             return value, self.differences(x)
-        rows = np.flatnonzero(self._doubted(x, value, J))
-        if rows.size:
-            rows = rows[self.contradicted(x[rows], J[rows])]
+        rows = np.flatnonzero(self._wrong_slopes(x, value, J))
         if rows.size:
             J[rows] = self.differences(x[rows])
         return value, J
@@ -126,16 +126,23 @@ class Judged:
         return float((6 if self.steps is None else 2) * len(self.scale) + 1)
 
     def wrong(self, x: Array, value: Array, J: Array) -> Mask:
-        """Finds the rows (rows,) of x whose values or slopes are not the function's own: along one
-        direction, and where that leaves a doubt, along each."""
+        """Finds the rows (rows,) of x whose values or slopes are not the function's own."""
         with np.errstate(all="ignore"):
             here = np.asarray(self.function(x), dtype=float)
             alike = np.abs(self.near(value, here) - here) <= _VALUES * self._size(x, here, J)
             both = ~np.isfinite(value) & ~np.isfinite(here)
             wrong: Mask = np.any(~(alike | both), axis=1)
-            rows = np.flatnonzero(self._doubted(x, here, J) & ~wrong)
-            if rows.size:
-                wrong[rows] = self.contradicted(x[rows], J[rows])
+            right = np.flatnonzero(~wrong)
+            wrong[right] = self._wrong_slopes(x[right], here[right], J[right])
+        return wrong
+
+    def _wrong_slopes(self, x: Array, here: Array, J: Array) -> Mask:
+        """Finds the rows (rows,) of x whose slopes are not those of the function, whose values are
+        `here`: along one direction, and where that leaves a doubt, along each."""
+        wrong = self._doubted(x, here, J)
+        rows = np.flatnonzero(wrong)
+        if rows.size:
+            wrong[rows] = self.contradicted(x[rows], J[rows])
         return wrong
 
     def _size(self, x: Array, here: Array, J: Array) -> Array:
@@ -159,7 +166,8 @@ class Judged:
         per_step = np.where(np.isfinite(per_step), per_step, 0.0)
         along = _NARROW * self.scale * _direction(per_step)
         z = np.asarray(self.function(np.concatenate([x + along, x - along])), dtype=float)
-        up, down = np.split(z, 2)
+        up = z[: len(x)]
+        down = z[len(x) :]
         moved = (J * along[:, None]).sum(axis=2)
         ahead = self.near(up, here) - here
         behind = self.near(down, here) - here
@@ -195,9 +203,14 @@ def _direction(per_step: Array) -> Array:
     n = per_step.shape[2]
     largest = per_step.max(axis=1, initial=0.0) + np.finfo(float).tiny
     weight = 1.0 / np.maximum(largest, _LEAST * largest.max(axis=1, keepdims=True))
-    weight = weight / weight.max(axis=1, keepdims=True)
+    return weight / weight.max(axis=1, keepdims=True) * _signed_parts(n)
+
+
+@cache
+def _signed_parts(n: int) -> Array:
+    """Returns numbers (n,) from .5 to 1 of both signs, always the same."""
     rng = np.random.default_rng(1)
-    return weight * rng.uniform(0.5, 1.0, n) * rng.choice([-1.0, 1.0], n)
+    return read_only(rng.uniform(0.5, 1.0, n) * rng.choice([-1.0, 1.0], n))
 
 
 def same_values(a: Array, b: Array) -> bool:
@@ -238,7 +251,7 @@ def judged(
             J = tried._by_complex_steps(points)
         except Exception as error:
             return replace(tried, why=f"it takes no complex numbers ({type(error).__name__})")
-        wrong = tried.contradicted(points, J)
+        wrong = tried._wrong_slopes(points, value, J)
         if 2 * wrong.sum() > len(points):
             return replace(tried, why="complex steps find other slopes than differences")
         rough = tried._roughness(points, value, J)[~wrong]

@@ -4,8 +4,9 @@ truth."""
 from __future__ import annotations
 
 import copy
+import inspect
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, cast
@@ -137,7 +138,7 @@ def require_function(model: Measurement) -> None:
     """Refuses a model from outside of this package that is no function of x alone: one that gives
     one x other readings or other slopes after another x, in another batch, or on a fresh object,
     returns other shapes than (trials, m) and (trials, m, n), writes into x, or ends the process."""
-    if all(cls.__module__.startswith("ipe_bench.") for cls in component_classes(model)):
+    if _all_ours(component_classes(model)):
         return
     try:
         complaint = _irregularity(model, definition_of(model).digest)
@@ -145,6 +146,10 @@ def require_function(model: Measurement) -> None:
         complaint = _irregularity.__wrapped__(model, "")
     if complaint:
         raise UserError(f"measurement={model.name}: {complaint}")
+
+
+def _all_ours(parts: Iterable[Any]) -> bool:
+    return all(part.__module__.startswith("ipe_bench.") for part in parts)
 
 
 @lru_cache(maxsize=256)
@@ -157,7 +162,10 @@ def _irregularity(model: Measurement, definition: str) -> str:
     fresh: Any = replace(cast(Any, model)) if is_dataclass(model) else copy.copy(model)
     if component_classes(fresh) != component_classes(model):
         return "what its options name was defined anew since it was made; make the model anew"
-    shapes = {"simulate": (len(x), model.m), "jacobian": (len(x), model.m, model.n)}
+    shapes: dict[str, tuple[int, ...]] = {"simulate": (len(x), model.m)}
+    if not _all_ours(filter(inspect.isclass, component_classes(model))):
+        # Slopes of a function alone are ours, and held against it wherever they are used.
+        shapes["jacobian"] = (len(x), model.m, model.n)
     for method, shape in shapes.items():
         call = getattr(model, method)
         try:

@@ -206,7 +206,7 @@ CHANGES = {
     "slopes-unjudged": Change(
         "functions",
         "complex steps are not doubted where they are used",
-        "rows = np.flatnonzero(self._doubted(x, value, J))",
+        "rows = np.flatnonzero(self._wrong_slopes(x, value, J))",
         "rows = np.empty(0, dtype=int)",
         "test_judged.py",
     ),
