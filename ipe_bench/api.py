@@ -57,7 +57,7 @@ def run(
     prior: Prior | None = None,
     error_scale: float | None = None,
     seed: int | None = None,
-    precision: float | Mapping[str, float] | None = None,
+    precision: float | None = None,
     time_limit: float | None = None,
     output: Path | str | None = None,
     execution: Execution | None = None,
@@ -75,8 +75,7 @@ def run(
         seed: number that all draws follow from; that of each scenario unless given.
         trials: of each scenario, 1000 unless given; with `precision` the most, 100,000 unless
             given.
-        precision: 0.01, or {"success": 0.01, "rmse": 0.05} (relative): trials are added until
-            intervals are so narrow.
+        precision: such as 0.01: trials are added until the intervals of success are that narrow.
         time_limit: seconds after which no more blocks are added.
         output: folder of the results; what it has is not computed again. None: nothing is kept.
         execution, block_size: where trials are computed, and how many in a block.

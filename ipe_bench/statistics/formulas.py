@@ -25,7 +25,6 @@ from ipe_bench.statistics.intervals import (
     mean_nees,
     quantile,
     rms_interval,
-    rms_sequence,
     unseen,
 )
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, FLOOR, NIS, Sample
@@ -200,13 +199,6 @@ def rmse_ends(s: Sample) -> tuple[Array, Array]:
     few = few_carry(squares(s), degrees(s))
     unknown = few | (rmse_unseen(s) > 0)
     return low, np.where(unknown, np.nan, high)
-
-
-@once
-def rmse_sequence(s: Sample) -> tuple[Array, Array]:
-    """Computes ends (n + 1,) of such intervals at all numbers of trials at once, from the errors
-    that were seen."""
-    return rms_sequence(squares(s), degrees(s))
 
 
 def ends_in_units(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Ends]:

@@ -47,9 +47,6 @@ _WEIGHT = TIGHTEST / (_SURPRISE + math.log(_SURPRISE) + 1)
 """Weight of the mixtures, in trials: it makes those of 95 % tightest there (Waudby-Smith et al.,
 2024, appendix)."""
 _HALVINGS = 50
-FIRST = 100
-"""Trials from which an asymptotic sequence begins; one that begins earlier misses errors with rare
-large ones."""
 UNUSUAL = 1e-3
 """Share of normal errors that are at least as large as one that counts as unusual."""
 RARE = 10
@@ -175,26 +172,24 @@ class Squares:
     squares overflow."""
 
     count: int
-    size: Array
-    """(k,), the largest."""
     mean: Array
-    """(k,), in units of the size."""
+    """(k,)"""
     deviations: Array
-    """(k,), sum of squared deviations from the mean, in units of the size."""
+    """(k,), sum of squared deviations from the mean."""
 
     @classmethod
     def of(cls, squares: Array) -> Squares:
         """Summarises squares (k, trials)."""
         count = squares.shape[1]
-        size = squares.max(axis=1, initial=0.0)
         if not count:
-            return cls(0, size, 0 * size, 0 * size)
-        largest = size[:, None]
+            nothing = np.zeros(len(squares))
+            return cls(0, nothing, nothing)
+        largest = squares.max(axis=1, keepdims=True)
         with np.errstate(all="ignore"):
             scaled = np.where(largest > 0, squares / largest, 0.0)
         mean = scaled.mean(axis=1)
         deviations = ((scaled - mean[:, None]) ** 2).sum(axis=1)
-        return cls(count, size, mean, deviations)
+        return cls(count, mean, deviations)
 
     @property
     def effective(self) -> Array:
@@ -445,35 +440,6 @@ def first_that(holds: Callable[[float], bool], inside: float, outside: float) ->
         else:
             inside = middle
     return outside
-
-
-def rms_sequence(squares: Squares, degrees: Array, level: float = LEVEL) -> tuple[Array, Array]:
-    """Computes the confidence sequence of the root mean square (k,) from the logarithm of the mean
-    square; NaN below `FIRST`, and where few trials carry the sum; see `few_carry`.
-
-    The asymptotic confidence sequence of a Gaussian mixture (Waudby-Smith, Arbour, Sinha, Kennedy
-    and Ramdas, Ann. Statist. 52, 2024, theorem 2.2), tightest at `TIGHTEST`: what the central limit
-    theorem is to a fixed number of trials.
-    """
-    size = squares.size
-    count = squares.count
-    if count < FIRST:
-        unknown = np.full(len(size), np.nan)
-        return unknown, unknown
-    # The reach of the mixture in standard deviations of one trial,
-    # sqrt(2 (t rho^2 + 1) / (t^2 rho^2) log(sqrt(t rho^2 + 1) / alpha)) after t trials.
-    rho2 = 1 / _WEIGHT
-    grown = count * rho2 + 1
-    surprise = math.log(math.sqrt(grown) / (1 - level))
-    of_one = math.sqrt(2 * grown / (count**2 * rho2) * surprise)
-    with np.errstate(all="ignore"):
-        deviation = np.sqrt(squares.deviations / (count - 1)) / squares.mean
-        # The root of a mean square has half the relative error of the mean square.
-        reach = deviation * of_one / 2
-        ends = np.sqrt(size * squares.mean) * np.exp([-reach, reach])
-    ends = np.where(size > 0, ends, 0.0)
-    low, high = np.where(few_carry(squares, degrees), np.nan, ends)
-    return low, high
 
 
 # Quantiles ----------------------------------------------------------------------------------------

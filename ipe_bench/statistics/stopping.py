@@ -5,21 +5,20 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ipe_bench.basics.definitions import pinned
-from ipe_bench.basics.errors import UserError, refuse_unknown
+from ipe_bench.basics.errors import UserError
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute, new_name, result_keys, validate
 from ipe_bench.runs.schedule import BLOCK_SIZE, Watcher
 from ipe_bench.runs.store import ResultKey, describe_names
 from ipe_bench.statistics.collect import collect
-from ipe_bench.statistics.formulas import rmse_sequence, rmse_unseen
 from ipe_bench.statistics.intervals import share_sequence
 from ipe_bench.statistics.records import SCORES
 from ipe_bench.statistics.registry import summary_rows
@@ -30,36 +29,17 @@ from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS
 
 NARROW = "every interval is narrow enough"
 """Reason of a scenario that stops because it has the requested precision."""
-WITH_PRECISION = ("success", "rmse")
-"""Statistics with a precision: success as a difference of shares, of every estimator; rmse as a
-ratio less 1, of the root mean square over parameters of error over bound, of the trials that an
-estimator solved."""
 
 
-def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
-    """Returns the requested precision by statistic, valid at any number of trials: from a number,
-    which is that of success, or from numbers by name.
-
-    Raises:
-        UserError: it is neither.
-    """
-    if isinstance(given, Mapping):
-        named = {str(name): value for name, value in given.items()}
-    else:
-        named = {"success": given}
-    for name, value in named.items():
-        refuse_unknown(f"precision.{name}", name, WITH_PRECISION, "statistic")
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not 0 < value < 1:
-            key = f"precision.{name}" if isinstance(given, Mapping) else "precision"
-            raise UserError(f"{key}={value}: give a number between 0 and 1, such as 0.01")
-    if not named:
-        raise UserError("precision={}: give a number between 0 and 1, such as 0.01")
-    return named
+def require_precision(given: Any) -> None:
+    """Refuses what is no half of the width that an interval of success is to have."""
+    is_number = isinstance(given, int | float) and not isinstance(given, bool)
+    if not is_number or not 0 < given < 1:
+        raise UserError(f"precision={given}: give a number between 0 and 1, such as 0.01")
 
 
 class Distance(NamedTuple):
-    """Tells how far the interval of a statistic is from the requested precision."""
+    """Tells how far an estimator's interval of success is from the requested precision."""
 
     ratio: float
     """Half its width over the precision, above 1 if it is too wide."""
@@ -69,42 +49,14 @@ class Distance(NamedTuple):
 NO_READINGS = Distance(math.inf, "")
 
 
-def _distances(sample: Sample, wanted: Mapping[str, float]) -> Iterator[Distance]:
-    """Computes the distance of each statistic from its precision."""
-    for statistic, precision in wanted.items():
-        if statistic == "success":
-            width = _width_of_success(sample)
-            shown = f"{100 * width:.2g} %"
-        else:
-            width = _width_of_rmse(sample)
-            shown = _words_of_rmse(sample, width)
-        yield Distance(width / precision, f"{sample.group.estimator}: {statistic} ± {shown}")
-
-
-def _width_of_success(sample: Sample) -> float:
+def _distance(sample: Sample, precision: float) -> Distance:
+    """Computes the distance from an interval that is valid at any number of trials."""
     success = sample.scalars["success"]
     share = float(success.mean())
     low, high = share_sequence(int(success.sum()), len(sample))
-    return max(high - share, share - low)
-
-
-def _width_of_rmse(sample: Sample) -> float:
-    """Computes the larger end of the interval over its centre, less 1; infinite where there is
-    none."""
-    low, high = (float(end[sample.n]) for end in rmse_sequence(sample))
-    if not low > 0 or not math.isfinite(high):
-        return math.inf
-    return float(np.sqrt(high / low)) - 1
-
-
-def _words_of_rmse(sample: Sample, width: float) -> str:
-    if math.isinf(width):
-        return "too few trials, or a few dominate"
-    words = f"{100 * width:.2g} %"
-    rare = float(rmse_unseen(sample)[sample.n])
-    if rare > 0:
-        words += f", unless errors are larger in 1 of {1 / rare:.0f} trials or fewer"
-    return words
+    width = max(high - share, share - low)
+    words = f"{sample.group.estimator}: success ± {100 * width:.2g} %"
+    return Distance(width / precision, words)
 
 
 def compute_until(
@@ -113,7 +65,7 @@ def compute_until(
     most: int | None,
     output: Path | str,
     *,
-    precision: float | Mapping[str, float] | None,
+    precision: float | None,
     time_limit: float | None = None,
     execution: Execution | None = None,
     block_size: int | None = None,
@@ -127,7 +79,7 @@ def compute_until(
 
     Returns the messages of what failed, and a row per scenario that has a precision: its names, how
     many `trials` it took, the `reason` why it took no more, `NARROW` if the precision is reached,
-    and the `widest` statistic, which is farthest from it.
+    and the `widest` interval, which is farthest from it.
 
     Raises:
         UserError: what was asked for cannot be computed; nothing is computed then.
@@ -144,7 +96,7 @@ def compute_until(
             )
         trials = TRIALS if most is None else most
         return compute(scenarios, estimators, trials, output, block_size=block_size, **options), []
-    wanted = precision_of(precision)
+    require_precision(precision)
     budget = MOST_TRIALS if most is None else most
     if time_limit is not None and not time_limit > 0:
         raise UserError(f"time_limit={time_limit}: give a number of seconds above 0")
@@ -153,7 +105,7 @@ def compute_until(
     end = math.inf if time_limit is None else time.monotonic() + time_limit
     validate(scenarios, estimators, budget, block_size)
     block_size = BLOCK_SIZE if block_size is None else block_size
-    options |= {"block_size": block_size, "further": {"precision": wanted}}
+    options |= {"block_size": block_size, "further": {"precision": precision}}
     at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
     names = [new_name() for _ in scenarios]
     failures = []
@@ -164,7 +116,9 @@ def compute_until(
             if i in stops:
                 continue
             failed = compute([scenario], estimators, at[i], output, record_as=names[i], **options)
-            widest = _widest(_stored(scenario, estimators, output), wanted)
+            stored = _stored(scenario, estimators, output)
+            distances = [_distance(sample, precision) for sample in stored]
+            widest = max(distances, key=lambda one: one.ratio, default=NO_READINGS)
             full = at[i] >= budget
             reason = _reason_to_stop(failed, widest, full, late=time.monotonic() >= end)
             if reason:
@@ -175,11 +129,6 @@ def compute_until(
             else:
                 at[i] = next_trials(at[i], widest.ratio, block_size, budget)
     return tuple(failures), [stops[i] for i in range(len(scenarios))]
-
-
-def _widest(stored: Iterable[Sample], wanted: Mapping[str, float]) -> Distance:
-    distances = [one for sample in stored for one in _distances(sample, wanted)]
-    return max(distances, key=lambda one: one.ratio, default=NO_READINGS)
 
 
 def _reason_to_stop(failed: Sequence[str], widest: Distance, full: bool, late: bool) -> str:
