@@ -15,7 +15,6 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.calibration import POINTS, band
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
-from ipe_bench.statistics.formulas import failed, share
 from ipe_bench.statistics.intervals import quantile, quantiles
 from ipe_bench.statistics.one_track import best_tracker, one_track
 from ipe_bench.statistics.path_columns import epoch_curves
@@ -53,9 +52,8 @@ class Analysis:
     pairs: pd.DataFrame
     """Every pair of estimators on every scenario; see `comparisons.compare_pairs`."""
     scores: pd.DataFrame
-    """Per scenario and estimator: capped mean error, median costs, and, over the trials that every
-    estimator of the scenario has, their number `shared_trials` and the shares `shared_success` and
-    `shared_silent`."""
+    """Per scenario and estimator: capped mean error, median costs, and `shared_trials`, the
+    number of trials that every estimator of the scenario has."""
     distributions: pd.DataFrame
     """Quantiles of the Mahalanobis error over all trials: `probability` (of `PROBABILITIES`) and
     `distance`."""
@@ -163,7 +161,7 @@ class Begun:
         of_group = dict(sample.group.columns) | {"estimator": sample.group.estimator}
         found["endings"] += [of_group | row for row in _ending_rows(sample)]
         scores = rows_of(SCORES, sample)[-1]
-        found["scores"].append(where | scores | _shared(sample))
+        found["scores"].append(where | scores | {"shared_trials": int(sample.present.sum())})
         distances = quantiles(sample.distance, PROBABILITIES)
         curve = {"probability": PROBABILITIES, "distance": distances}
         found["distributions"].append(where | curve)
@@ -244,15 +242,6 @@ def _joined(parts: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     if not arrays:
         return frame
     return frame.explode(arrays, ignore_index=True).infer_objects()
-
-
-def _shared(sample: Sample) -> dict[str, Any]:
-    """Computes success and silent failure in the trials that every estimator of the scenario
-    has."""
-    among = sample.present
-    silent = failed(sample, known=False, among=among)
-    success = share(sample.scalars["success"][among])
-    return {"shared_trials": int(among.sum()), "shared_success": success, "shared_silent": silent}
 
 
 def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, Any]]:

@@ -247,15 +247,14 @@ def _tests_fit(s: Sample) -> bool:
     return FIT in s.scalars and bool(np.isfinite(s.scalars[FIT]).any())
 
 
-def failed(s: Sample, *, known: bool, among: Array | slice = slice(None)) -> float:
+def failed(s: Sample, *, known: bool) -> float:
     """Computes the share that fails, by whether the estimator itself gives notice of it."""
     noticed = ~s.converged
     if _tests_fit(s):
         noticed = noticed | ~(s.scalars[FIT] >= FIT_LEVEL)
     if AMBIGUOUS in s.scalars:
         noticed = noticed | (s.scalars[AMBIGUOUS] > 0)
-    counted = ~s.scalars["success"] & (noticed == known)
-    return share(counted[among])
+    return share(~s.scalars["success"] & (noticed == known))
 
 
 def misfit(s: Sample) -> float:

@@ -198,13 +198,6 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="count",
         where=("solved_trials",),
     ),
-    _all(
-        "common_trials",
-        "common trials",
-        "Number of trials that every estimator of the scenario solved.",
-        lambda s: int((s.solved & s.solved_by_all).sum()),
-        kind="count",
-    ),
     Statistic(
         "equation",
         "equation",
@@ -302,15 +295,6 @@ STATISTICS: tuple[Statistic, ...] = (
         " parameter, one if a single trial carries the whole sum.",
         lambda s: f.squares(s).effective,
         where=("parameters",),
-    ),
-    Statistic(
-        "rmse_common",
-        "rmse, common",
-        "trials that every estimator of the scenario solved",
-        "Root mean square error.",
-        f.of_each(lambda s: f.rms_columns(s.error, s.solved & s.solved_by_all)),
-        given="common",
-        where=("solved_trials",),
     ),
     Statistic(
         "linear_bound",

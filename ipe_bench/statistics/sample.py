@@ -90,8 +90,6 @@ class Sample:
     """(trials, n), as the estimator reports it; NaN where it reports none."""
     present: Array
     """Whether every estimator of the scenario has the trial (trials,)."""
-    solved_by_all: Array
-    """(trials,)"""
     unread: Array
     """The numbers of the trials that have no readings, since the model gives none at their true
     parameters."""
@@ -99,9 +97,9 @@ class Sample:
     """Cache of derived quantities; see `formulas.once`."""
 
     @classmethod
-    def load(cls, collection: Collection, group: Group, present: Array, solved: Array) -> Sample:
-        """Loads the stored trials of a group; `present` and `solved` are the numbers of those that
-        all rivals have, and all solved."""
+    def load(cls, collection: Collection, group: Group, present: Array) -> Sample:
+        """Loads the stored trials of a group; `present` are the numbers of those that all rivals
+        have."""
         names = [p["name"] for p in group.footer["parameters"]]
         errors = [f"error_{name}" for name in names]
         deviations = [f"deviation_{name}" for name in names]
@@ -141,7 +139,6 @@ class Sample:
             error,
             deviation,
             present=np.isin(number, present),
-            solved_by_all=np.isin(number, solved),
             unread=every[~used],
         )
 
@@ -293,19 +290,15 @@ def label_of(number: Any) -> str:
 def samples(collection: Collection, groups: Sequence[Group]) -> Iterator[Sample]:
     """Yields the samples of one scenario that have trials."""
     present = []
-    solved = []
     for group in groups:
-        parts = [(cell, collection.load(cell, ["solved"])) for cell in group.cells]
-        numbers = np.concatenate([_numbers(cell, rows["trial"]) for cell, rows in parts])
-        right = np.concatenate([rows["solved"] for _, rows in parts]).astype(bool)
+        parts = [_numbers(cell, collection.load(cell, ["status"])["trial"]) for cell in group.cells]
+        numbers = np.concatenate(parts)
         # An estimator without any trials takes none from the others.
         if len(numbers):
             present.append(numbers)
-        solved.append(numbers[right])
     present_in_all = _in_all(present)
-    solved_by_all = _in_all(solved)
     for group in groups:
-        sample = Sample.load(collection, group, present_in_all, solved_by_all)
+        sample = Sample.load(collection, group, present_in_all)
         if len(sample):
             yield sample
         del sample  # before the next one takes as much memory

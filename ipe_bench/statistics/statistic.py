@@ -28,7 +28,7 @@ Where = Literal[
 ]
 """A table; its columns are in the order of the records. The overview and the terminal's table show
 those of plugins behind their own."""
-Condition = Literal["", "solved", "common"]
+Condition = Literal["", "solved"]
 ALL = "all"
 """The row of the summary over all parameters."""
 BEST = "may_be_best"

@@ -60,8 +60,6 @@ OTHER_MEANINGS = (
     *("bound", "order_median", "cost_to_limit_median", "error_over_bound", "path_bound"),
 )
 """Medians that are no errors."""
-OF_SOME = ("solved", "common")
-"""What stands in the names of columns over some of the trials."""
 KEYS = ("error scale", "estimator", "parameter", "first", "second", "status", "message")
 ALIKE = 0.1
 """Part by which errors differ at most where an axis may leave them out."""
@@ -107,7 +105,7 @@ def helped_by_failing(was: Analysis, now: Analysis, label: str, scale: float) ->
             continue
         first, second = (of_result(getattr(one, name), label, scale) for one in (was, now))
         for column in first.select_dtypes("number").columns if len(first) else ():
-            if any(word in column for word in OF_SOME) or column in ("error_scale", "probability"):
+            if "solved" in column or column in ("error_scale", "probability"):
                 continue
             a, b = first[column].to_numpy(dtype=float), second[column].to_numpy(dtype=float)
             rises = (b > a + 1e-9).any()

@@ -143,7 +143,6 @@ def test_survivors_are_shown_as_survivors(synthetic):
     solved, overview = tables["solved_trials"], tables["overview"]
     at = solved["estimator"].index
     assert solved["efficiency"][at("lucky")].endswith(" (1)")
-    assert solved["rmse, common"][at("steady")].endswith(" (1)")
     assert "(" not in solved["efficiency"][at("steady")]
     assert "filter" not in solved["estimator"]
     # Where everybody stands in one column, it is over the same trials for everybody.

@@ -19,7 +19,7 @@ from ipe_bench.report.page.headline import headline
 from ipe_bench.report.tables.table import Part
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
-from ipe_bench.statistics.formulas import CAP, failed, share
+from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import STATISTICS
 from ipe_bench.statistics.sample import Sample
 from ipe_bench.statistics.statistic import BEST, rows_of
@@ -316,7 +316,6 @@ def _drawn(
         scalars["path_nees"] = 0.5 * (
             scalars["nees"] + there.mean_nees * rng.chisquare(10 * n, trials) / 10
         )
-    everywhere = np.ones(trials, dtype=bool)
     return Sample(
         collection,
         group,
@@ -324,8 +323,7 @@ def _drawn(
         scalars,
         error,
         deviation,
-        everywhere,
-        everywhere,
+        np.ones(trials, dtype=bool),
         np.empty(0, dtype=int),
     )
 
@@ -340,7 +338,7 @@ def _analysis(drawn: Board, collection: Any, samples: Mapping[tuple[int, str], S
         best = may_be_best(np.column_stack([one.success for one in outcomes.values()]))
         for label, mark in zip(here, best.tolist(), strict=True):
             summary += _rows(here[label], mark)
-            scores.append({**where, "estimator": label, **_shared(here[label])})
+            scores.append({**where, "estimator": label, "shared_trials": len(here[label])})
         pairs += [where | pair for pair in compare_pairs(outcomes)]
     none = pd.DataFrame()
     held = dict.fromkeys(
@@ -369,8 +367,3 @@ def _rows(s: Sample, may_be_the_best: bool) -> list[dict[str, Any]]:
     whole = head | {"parameter": "all"} | rows_of(_KEPT, s)[-1]
     whole["path_error_median"] = float(np.median(s.scalars.get("path_error", np.nan)))
     return [*({**whole, "parameter": name} for name in s.names), whole]
-
-
-def _shared(s: Sample) -> dict[str, Any]:
-    silent, success = failed(s, known=False), share(s.scalars["success"])
-    return {"shared_trials": len(s), "shared_success": success, "shared_silent": silent}

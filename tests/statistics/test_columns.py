@@ -58,8 +58,6 @@ class Trials:
     sizes: np.ndarray
     linear: np.ndarray
     """The linear bound (n,)."""
-    others: np.ndarray
-    """Trials that the other estimator solved."""
     equation: str
     told: Mapping[str, np.ndarray]
     """The summary's columns (n + 1,)."""
@@ -241,7 +239,6 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
     "nees_median_low_if_honest": nees_median_limit(0.025),
     "nees_median_high_if_honest": nees_median_limit(0.975),
     "solved_trials": lambda t: np.sum(t.solved),
-    "common_trials": lambda t: np.sum(t.solved & t.others),
     "equation": lambda t: t.equation,
     "given": lambda t: "readings",
     "family": lambda t: "IPE" if t.equation == "frozen" else "least squares",
@@ -254,7 +251,6 @@ DEFINITIONS: dict[str, Callable[[Trials], Any]] = {
     "effective_trials": lambda t: (
         t.solved_squares().sum(axis=1) ** 2 / (t.solved_squares() ** 2).sum(axis=1)
     ),
-    "rmse_common": lambda t: t.units(rms(t.error[t.solved & t.others])),
     "linear_bound": lambda t: t.units(t.linear),
     "crlb": lambda t: t.units(rms(t.truth["crlb"][t.solved])),
     "bayes_bound": lambda t: t.units(rms(t.truth["bayes"][t.solved])),
@@ -403,8 +399,7 @@ def drawn(folder, seed: int) -> Trials:
         **of_path,
     )
     read: np.ndarray = np.asarray(status != "no_readings")
-    others = read & (rng.random(N) < 0.7)
-    other = {"status": np.where(read, "converged", "no_readings").astype(object), "solved": others}
+    other = {"status": np.where(read, "converged", "no_readings").astype(object)}
     store.add(
         scenario, "other", error, block=block, estimator=estimator.__class__(option=1), **other
     )
@@ -419,7 +414,6 @@ def drawn(folder, seed: int) -> Trials:
         path_bound[read],
         np.array([p.size for p in scenario.measurement.parameters]),
         linear,
-        others[read],
         estimator.equation,
         {column: frame[column].to_numpy() for column in summary_columns()},
     )
