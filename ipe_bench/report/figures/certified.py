@@ -15,11 +15,9 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.style import BOUND_COLOR, RAMP
 from ipe_bench.report.words import percent
-from ipe_bench.statistics.certified import certified_table, published_table
+from ipe_bench.statistics.certified import SOLVED, certified_table, published_table
 
 _FOUND = "#0b5a8f"
-SOLVED = 4
-"""Digits from which on a problem is solved."""
 _STEPS = {0: RAMP[0], 1: RAMP[4], 2: RAMP[8], 3: RAMP[11], SOLVED: RAMP[18], 8: RAMP[20]}
 """Colours from so many digits on: dark where a problem is solved."""
 
