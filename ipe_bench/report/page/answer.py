@@ -693,10 +693,8 @@ def _other_minima(found: Examination, names: Sequence[str]) -> Iterator[str]:
         )
     equal = [one.x for one in found.ambiguous if one.same_readings]
     if equal:
-        errors = found.standard_errors
-        ways = dict.fromkeys(_changed(names, found.x, x, errors) or at(x) for x in equal)
-        listed = "; with ".join(list(ways)[:_MOST_MINIMA])
-        yield f"The readings are exactly the same with {listed}."
+        listed = "; or ".join([at(x) for x in equal[:_MOST_MINIMA]])
+        yield f"The readings are exactly the same at {listed}."
 
 
 def _on_profiles(found: Examination, names: Sequence[str]) -> Iterator[str]:
@@ -718,44 +716,6 @@ def _on_profiles(found: Examination, names: Sequence[str]) -> Iterator[str]:
             f"An end of the profile is missing: {', '.join(lost)}; the search met a better fit, or"
             " no minimum."
         )
-
-
-def _changed(names: Sequence[str], x: Array, y: Array, errors: Array) -> str:
-    """Names the signs, turns and exchanges of parameters that lead from x to y; empty if others are
-    needed."""
-    near = 0.01 * errors
-    words = []
-    left = [i for i in range(len(x)) if abs(y[i] - x[i]) > near[i]]
-    while left:
-        i = left.pop(0)
-        if abs(x[i] + y[i]) <= near[i]:
-            words.append(f"{names[i]} of the other sign")
-            continue
-        turned = _turned(y[i] - x[i], near[i])
-        if turned:
-            words.append(f"{names[i]} shifted by {turned}")
-            continue
-        turned = _turned(y[i] + x[i], near[i])
-        if turned:
-            words.append(f"{names[i]} of the other sign and shifted by {turned}")
-            continue
-        taking = [j for j in left if abs(y[i] - x[j]) <= near[j]]
-        exchanged = [j for j in taking if abs(y[j] - x[i]) <= near[i]]
-        if not exchanged:
-            return ""
-        other = exchanged[0]
-        left.remove(other)
-        words.append(f"{names[i]} and {names[other]} exchanged")
-    return ", ".join(words)
-
-
-def _turned(shift: float, near: float) -> str:
-    """Words a shift by turns of an angle, in rad or degrees; empty if it is none."""
-    for half in (np.pi, 180.0):
-        halves = round(shift / half)
-        if near < 0.05 * half and halves and abs(shift - halves * half) <= near:
-            return "half a turn" if halves % 2 else "whole turns"
-    return ""
 
 
 def store(
