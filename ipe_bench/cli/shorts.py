@@ -318,6 +318,16 @@ class _Reader:
                     f" parameters.{name}.fixed={value} keeps the value"
                 )
 
+    def _refuse_starts_of_columns(self) -> None:
+        """Refuses the start of a column, which would make it a parameter."""
+        for name in self._typed_starts:
+            if name in self._columns_besides([]):
+                raise UserError(
+                    f"measurement.start.{name}: makes {name} a parameter, and {self.files[0]} has a"
+                    f" column {name}; remove the key, or leave the column out by"
+                    f" ignore_columns=[{name}]"
+                )
+
     # Columns
 
     def _columns_left(self, taken: Sequence[str]) -> list[str]:
@@ -455,6 +465,7 @@ class _Reader:
         self._refuse_default_of_column(file, signature)
         self._refuse_absent_columns(file, signature)
         self._refuse_bare(signature.arguments)
+        self._refuse_starts_of_columns()
         words = ["measurement=function", f"measurement.of={module}:{chosen.name}"]
         model = f"Model: {signature.text} of {file}{_starts_phrase(signature.starts)}."
         outputs = self._outputs(chosen, signature.text, signature.columns)
@@ -471,8 +482,18 @@ class _Reader:
         return self._short(words, lines, self._text_columns_left(columns, reading))
 
     def _refuse_default_of_column(self, file: str, signature: _Signature) -> None:
-        """Refuses an argument that its default makes a parameter, and the file a column."""
+        """Refuses an argument that its default makes a parameter, or its place a constant, and the
+        file a column."""
         for column in self._columns_left(signature.columns):
+            if column in signature.constants and not self._last_value("measurement.reading"):
+                remedy = f"ignore_columns=[{column}] leaves the column out"
+                if len(self._columns_left(signature.columns)) == 1:
+                    remedy = f"measurement.reading={column} says that it has the readings"
+                raise UserError(
+                    f"{file}: the argument {column} of {signature.text} stands behind *, which"
+                    f" makes it a constant, and {self.files[0]} has a column {column}; put it"
+                    f" before *, without a default, to take the column; {remedy}"
+                )
             if column in signature.defaults:
                 raise UserError(
                     f"{file}: the argument {column} of {signature.text} has a default, which makes"
@@ -578,6 +599,7 @@ class _Reader:
             self._refuse_other_reading(named["reading"], names)
         what = f"the formula of {', '.join(names)}"
         self._refuse_bare(names)
+        self._refuse_starts_of_columns()
         if not columns and len(self._columns_left([])) > 1:
             self._refuse_without_column(names, self._last_value("measurement.reading") or usual)
         reading = self._reading_column(what, columns, usual)
@@ -726,6 +748,8 @@ class _Signature(NamedTuple):
     """Starts by the function's defaults, where none is typed."""
     starts: dict[str, str]
     """All starts, in the order of the arguments."""
+    constants: list[str]
+    """Arguments behind *."""
 
     @classmethod
     def of(cls, function: ast.FunctionDef, typed: dict[str, str]) -> Self:
@@ -740,8 +764,9 @@ class _Signature(NamedTuple):
                 defaults[name] = ast.unparse(value)
         known = {**defaults, **typed}
         starts = {name: known[name] for name in arguments if known.get(name)}
+        constants = [one.arg for one in function.args.kwonlyargs]
         text = f"{function.name}({', '.join(arguments)})"
-        return cls(text, arguments, columns, defaults, starts)
+        return cls(text, arguments, columns, defaults, starts, constants)
 
 
 def _require_entries(file: str, content: dict[str, Any], key: str) -> None:

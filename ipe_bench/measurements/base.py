@@ -212,6 +212,10 @@ class Measurement(Component, ABC):
         added."""
         return np.zeros(self.m)
 
+    def unit_of(self, output: str) -> str:
+        """Returns the unit of the readings of an output, or of another group of them."""
+        return self.reading_unit
+
     def hindrance(self, x: Array) -> str:
         """Says why the readings at x (n,) cannot be computed; empty if they can."""
         finite = np.isfinite(self.simulate(x[None])[0])
@@ -421,6 +425,7 @@ class Forwarding(Measurement):
     offset = _forwarded()
     m = _forwarded()
     reading_unit = _forwarded()
+    unit_of = _forwarded()
     reading_name = _forwarded()
     usual_noise = _forwarded()
     own_parameters = _forwarded()

@@ -4,7 +4,7 @@ columns of a file."""
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -46,12 +46,22 @@ class WrittenModel(Measurement):
     """The names of the columns that it takes from the readings."""
     reading: str
     circular: tuple[str, ...] = ()
+    outputs: Collection[str] = ()
 
     own: tuple[str, ...] = ()
 
     @property
     def reading_unit(self) -> str:
-        return self.unit
+        return "" if self._other_angles else self.unit
+
+    def unit_of(self, output: str) -> str:
+        return "" if self._other_angles and output not in self.circular else self.unit
+
+    @property
+    def _other_angles(self) -> bool:
+        """Whether some outputs are angles, so that the unit is theirs alone."""
+        angles = {*self.circular}
+        return bool(angles) and self.reading not in angles and not angles >= {*self.outputs}
 
     @property
     def reading_name(self) -> str:

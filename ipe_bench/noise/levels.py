@@ -89,8 +89,8 @@ class Levels:
     """Names of the groups; a single one has none."""
     group: NDArray[np.intp]
     """Place (m,) of each reading's group among these."""
-    unit: str = ""
-    """Unit of the readings."""
+    units: tuple[str, ...] = ()
+    """Units of the readings of each group; none: they have none."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -100,17 +100,21 @@ class Levels:
     def parameters(self) -> tuple[Parameter, ...]:
         """The levels, group by group."""
         # A level that stands alone is a standard deviation itself.
-        unit = self.unit if len(self.formula.names) == 1 else ""
-        named = [
-            f"{name}_{group}" if group else name for group in self.groups for name in self.names
-        ]
-        return tuple(Parameter(name, unit) for name in named)
+        alone = len(self.formula.names) == 1
+        units = self.units if alone and self.units else ("",) * len(self.groups)
+        found = []
+        for group, unit in zip(self.groups, units, strict=True):
+            names = [f"{name}_{group}" if group else name for name in self.names]
+            found += [Parameter(name, unit) for name in names]
+        return tuple(found)
 
     def restricted(self, rows: NDArray[np.intp]) -> Levels:
         """Returns the levels restricted to these rows."""
         kept, group = np.unique(self.group[rows], return_inverse=True)
         groups = tuple(self.groups[k] for k in kept)
-        return replace(self, weights=self.weights[rows], groups=groups, group=group)
+        units = tuple(self.units[k] for k in kept) if self.units else ()
+        weights = self.weights[rows]
+        return replace(self, weights=weights, groups=groups, group=group, units=units)
 
     def covariance(self, h: Array, theta: Array) -> Covariance:
         """Returns R of readings h (m,) for logarithms theta (k,) of the levels.

@@ -82,7 +82,8 @@ class Unknown(Noise):
         groups = tuple(dict.fromkeys(entries))
         group = np.array([groups.index(entry) for entry in entries], dtype=np.intp)
         weights = self.covariance(model.m).factor
-        found = Levels(read_sigma(self.sigma), weights, groups, group, model.reading_unit)
+        units = tuple(map(model.unit_of, groups))
+        found = Levels(read_sigma(self.sigma), weights, groups, group, units)
         levels = {p.name for p in found.parameters}
         both = levels & {p.name for p in model.physical_parameters}
         if both:

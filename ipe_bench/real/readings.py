@@ -482,7 +482,7 @@ def _require_units(table: TextTable, columns: Mapping[str, str], model: Measurem
         if choice in angles:
             _require_unit_of_angles(table, name, model)
         if choice in angles or not angles:
-            wanted = model.reading_unit
+            wanted = model.unit_of(choice)
             if wanted and unit_of(name) not in ("", wanted):
                 raise table.error(f"column {name}: the unit must be {wanted}; convert the values")
 
@@ -621,7 +621,8 @@ def _require_unit_of_angles(table: TextTable, heading: str, model: Measurement) 
     """Refuses a unit of angles that the model, which takes them for radians, does not state: a
     whole turn is another number in it."""
     unit = unit_of(heading)
-    if model.reading_unit or unit in ("", "rad"):
+    angles = getattr(model, "circular", ()) or (model.reading_name,)
+    if any(map(model.unit_of, angles)) or unit in ("", "rad"):
         return
     remedy = "convert the values to rad"
     if unit in ("deg", "°"):

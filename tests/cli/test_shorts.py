@@ -20,6 +20,7 @@ FILES = {
     "two.py": "def f(t, a=1.0):\n    return a * t\n\n\ndef g(t, a=1.0):\n    return a + t\n",
     "helped.py": "def _half(t):\n    return t / 2\n\n\ndef f(t, a=1.0):\n    return a * _half(t)\n",
     "timed.py": "def f(t=0.0, a=1.0):\n    return a * t\n",
+    "kept_back.py": "def f(t, a=1.0, *, temp=20.0):\n    return a * t + temp\n",
     "broken.py": "def f(t, a=1.0:\n    return a\n",
     "car.yaml": "next: {x: x + w}\nnoise: {w: 0.1}\nreadings: {z: x}\ndeviation: {z: 0.5}\n"
     "spread: {x: 2}\n",
@@ -253,6 +254,15 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
         ),
         (["f(t) = a*t+b", "line.csv"], 'write the formula alone, "a*t+b", or behind the name'),
         (["timed.py", "falling.csv"], "the argument t of f(t, a) has a default, which makes it"),
+        (
+            ["kept_back.py", "warm.csv"],
+            "stands behind *, which makes it a constant, and warm.csv has",
+        ),
+        (
+            ["a*t+b", "line.csv", "measurement.start.t=3"],
+            "measurement.start.t: makes t a parameter",
+        ),
+        (["falling.py", "falling.csv", "measurement.start.t=3"], "and falling.csv has a column t"),
         (["gins", "line.csv"], "gins: is not KEY=VALUE; write measurement=gins"),
         (["t+y", "line.csv"], "no column is left for the readings"),
         (["many.py", "three.csv"], "returns 2 arrays, and columns x, y, z are left for them; name"),

@@ -489,6 +489,32 @@ def test_ranges_and_bearings_of_one_function_are_fitted_as_by_scipy(laws):
     np.testing.assert_allclose(fit.covariance, expected, rtol=1e-6)
 
 
+def test_outputs_that_share_no_unit_have_a_deviation_and_a_level_each(laws):
+    """The means of two columns: their deviations are those of NumPy."""
+    (laws / "means.py").write_text("def h(t, a=1.0, b=1.0):\n    return a + 0 * t, b + 0 * t\n")
+    rng = np.random.default_rng(2)
+    long = 500 + 30 * rng.normal(size=9)
+    angle = 20 + 0.1 * rng.normal(size=9)
+    rows = [
+        f"{k},{d!r},{a!r}"
+        for k, (d, a) in enumerate(zip(long.tolist(), angle.tolist(), strict=True))
+    ]
+    table = laws / "means.csv"
+    table.write_text("\n".join(["t,long [m],angle [deg]", *rows]) + "\n")
+    law = ib.measurements.Function(
+        of="means:h", outputs=("long", "angle"), unit="deg", circular=("angle",)
+    )
+    lm = {"lm": ib.baselines.LevenbergMarquardt()}
+    noise = ib.noise.Unknown(by="output")
+    (fit,) = ib.estimate(law, table, lm, noise=noise, examine=False)
+    expected = {"long": np.std(long, ddof=1), "angle": np.std(angle, ddof=1)}
+    assert fit.residual_deviations == pytest.approx(expected)
+    units = {p.name: p.unit for p in fit.model.physical_parameters}
+    assert units == {"a": "", "b": "", "sigma_long": "", "sigma_angle": "deg"}
+    named = replace(law, circular=("long", "angle"))
+    assert {named.unit_of("long"), named.reading_unit} == {"deg"}
+
+
 @pytest.mark.parametrize("of", ["some_laws:pair", "some_jax_laws:pair"])
 def test_readings_of_a_tuple_stand_row_by_row(laws, of):
     if "jax" in of:

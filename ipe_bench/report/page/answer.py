@@ -69,6 +69,9 @@ _DOES = {
 """What the usual estimators do."""
 _HIDDEN = 1e-3
 """Share of its error below which a value is written with figures of its own."""
+_MOST_OUTPUTS = 3
+"""Outputs whose residuals' deviations have columns in a table."""
+_DEVIATION = " deviation is the standard deviation of the residuals, in the unit of the readings."
 _MOST_FIGURES = 12
 """Figures beyond which two numbers are not written to one place."""
 _FEW_FIGURES = 4
@@ -420,9 +423,17 @@ def _verdicts(answer: Answer) -> Table:
         texts("dof", [str(one.degrees_of_freedom) for one in fits]),
         texts("white p", [p_value(one.white_p, LEAST_P) for one in fits]),
         texts("outliers", [str(int(one.outliers.sum())) for one in fits]),
-        texts("deviation", [_number(one.residual_deviation) for one in fits]),
     ]
+    for output in _outputs_shown(fits):
+        shown = [_number(one.residual_deviations[output]) for one in fits]
+        columns.append(texts(f"deviation {output}".strip(), shown))
     return Table("verdicts", "Does the model fit?", "", columns, notes=list(_notes(answer)))
+
+
+def _outputs_shown(fits: Sequence[Fit]) -> list[str]:
+    """Lists the outputs whose residuals' deviations are shown: none of many."""
+    outputs = [*fits[0].residual_deviations]
+    return outputs if len(outputs) <= _MOST_OUTPUTS else []
 
 
 def _fit_p(p: float) -> str:
@@ -436,8 +447,8 @@ def _notes(answer: Answer) -> Iterator[str]:
     fits = answer.fits
     yield Legend(
         f"An estimate fits if p of chi-square is at least {FIT_LEVEL:g}. white p: p-value of the"
-        " Ljung-Box test, which is small if successive residuals resemble each other. deviation is"
-        " the standard deviation of the residuals, in the unit of the readings."
+        " Ljung-Box test, which is small if successive residuals resemble each other."
+        f"{_DEVIATION if _outputs_shown(fits) else ''}"
     )
     for one in fits:
         if one.message:
@@ -790,7 +801,7 @@ def estimate_content(answer: Answer) -> dict[str, Any]:
 
 _STORED = (
     *("message", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior", "beaten_by"),
-    *("lower_at", "iterations", "simulations", "correlation", "residual_deviation"),
+    *("lower_at", "iterations", "simulations", "correlation"),
 )
 
 
@@ -800,6 +811,7 @@ def _fitted(one: Fit, labels: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         {**labels[i], "normalised_residual": as_json(one.normalised[i])}
         for i in np.flatnonzero(one.outliers).tolist()
     ]
+    spread = {output: as_json(value) for output, value in one.residual_deviations.items()}
     return {
         "status": one.status.label,
         "estimates": _by_name(names, one.x),
@@ -810,6 +822,7 @@ def _fitted(one: Fit, labels: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "on_bounds": {names[k]: value for k, value in one.held_at.items()},
         "noise_level_estimated": one.levels or as_json(one.level),
         "outliers": outliers,
+        "residual_deviation": spread.get("", spread),
         **{name: as_json(getattr(one, name)) for name in _STORED},
     }
 
