@@ -27,6 +27,10 @@ _ELLIPSE = 2.448
 """Standard deviations of an ellipse that holds 95 % of a position's errors."""
 _ROOM = 0.06
 """Part of the span that an axis has beyond what is never cut."""
+_THIN = 0.02
+"""Part of the truth's span below which a band, or an ellipse, is not seen."""
+_ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+"""Factors by which ellipses may be drawn larger."""
 
 
 def draw(view: View) -> Iterator[Drawing]:
@@ -58,7 +62,7 @@ def draw(view: View) -> Iterator[Drawing]:
         NAME,
         f"One track at error scale {scale}",
         f"Trial {trial}: of the stored tracks, the one with {best}'s median error. Bands and"
-        " ellipses: 95 %.",
+        " ellipses: 95 %. Where a band would be too thin to see, the error is drawn.",
     )
 
 
@@ -73,22 +77,28 @@ def _looks(view: View, trackers: Sequence[str]) -> dict[str, Look]:
 
 
 def _draw_state(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:
-    """Draws a state; its axis holds the truth and the best track's band, and may cut the others."""
+    """Draws a state, or its error where the best track's band would be too thin to see; the axis
+    holds the truth and that band, and may cut the others."""
+    best = rows[rows["estimator"] == next(iter(look))]
+    is_thin = best["deviation"].median() < _THIN * np.ptp(best["truth"])
     kept: list[Array] = []
     for label, one in reversed(list(look.items())):
         own = rows[rows["estimator"] == label]
         at, name = common.times(own["at"])
-        mean = own["mean"].to_numpy(float)
+        from_which = own["truth"] if is_thin else 0.0
+        mean = (own["mean"] - from_which).to_numpy(float)
+        truth = (own["truth"] - from_which).to_numpy(float)
         half = _DEVIATIONS * own["deviation"].to_numpy(float)
         ax.fill_between(at, mean - half, mean + half, color=one.color, alpha=0.2, linewidth=0)
         ax.plot(at, mean, color=one.color)
         label = "truth" if label == next(iter(look)) else None
-        ax.plot(at, own["truth"], color=BLACK, linestyle=(0, (4, 2)), label=label)
+        ax.plot(at, truth, color=BLACK, linestyle=(0, (4, 2)), label=label)
         ax.set_xlabel(name)
-        kept = [mean - half, mean + half, own["truth"].to_numpy(float)]
+        kept = [mean - half, mean + half, truth]
     _limit(ax.set_ylim, kept)
     state = rows.iloc[0]
-    common.title(ax, with_unit(state["parameter"], state["unit"]))
+    words = f"error of {state['parameter']}" if is_thin else state["parameter"]
+    common.title(ax, with_unit(words, state["unit"]))
 
 
 def _limit(set_limits: Any, kept: Sequence[Array]) -> None:
@@ -108,16 +118,18 @@ def _draw_reading(ax: Any, rows: pd.DataFrame) -> None:
 
 
 def _draw_map(ax: Any, rows: pd.DataFrame, names: Sequence[str], look: Mapping[str, Look]) -> None:
-    """Draws the paths in the plane, with ellipses at the first, the middle and the last epoch; it
-    holds the truth and the best path, and may cut ellipses."""
+    """Draws the paths in the plane, with ellipses at the first, the middle and the last epoch,
+    enlarged where they would not be seen; it holds the truth and the best path, and may cut
+    ellipses."""
+    best = [_states_of(rows, next(iter(look)), name) for name in names]
+    times = _enlarged(*best)
     kept: list[list[Array]] = [[], []]
     for label, one in reversed(list(look.items())):
-        own = rows[rows["estimator"] == label]
-        x, y = (own[own["parameter"] == name] for name in names)
+        x, y = (_states_of(rows, label, name) for name in names)
         ax.plot(x["mean"], y["mean"], color=one.color)
         ax.plot(x["truth"], y["truth"], color=BLACK, linestyle=(0, (4, 2)))
-        for k in sorted({0, len(x) // 2, len(x) - 1}):
-            around = _ellipse(x.iloc[k], y.iloc[k])
+        for k in _shown_epochs(x):
+            around = _ellipse(x.iloc[k], y.iloc[k], times)
             ax.plot(*around, color=one.color, linewidth=0.7)
             if label == next(iter(look)):
                 kept[0].append(around[0])
@@ -126,13 +138,31 @@ def _draw_map(ax: Any, rows: pd.DataFrame, names: Sequence[str], look: Mapping[s
             axis.append(state["truth"].to_numpy(float))
     _limit(ax.set_xlim, kept[0])
     _limit(ax.set_ylim, kept[1])
-    x, y = (rows[rows["parameter"] == name].iloc[0] for name in names)
+    x, y = (state.iloc[0] for state in best)
     ax.set(xlabel=with_unit(names[0], x["unit"]), ylabel=with_unit(names[1], y["unit"]))
-    common.title(ax, "map")
+    common.title(ax, "map" if times == 1 else f"map, ellipses {times} times larger")
 
 
-def _ellipse(x: pd.Series[Any], y: pd.Series[Any]) -> Array:
-    """Returns points (2, 73) around a position that hold 95 % of its errors."""
+def _states_of(rows: pd.DataFrame, label: str, name: str) -> pd.DataFrame:
+    return rows[(rows["estimator"] == label) & (rows["parameter"] == name)]
+
+
+def _shown_epochs(x: pd.DataFrame) -> list[int]:
+    return sorted({0, len(x) // 2, len(x) - 1})
+
+
+def _enlarged(x: pd.DataFrame, y: pd.DataFrame) -> int:
+    """Returns the least factor with which the largest ellipse of a path is seen in each
+    direction."""
+    at = _shown_epochs(x)
+    largest = np.array([state["deviation"].iloc[at].max() for state in (x, y)])
+    least = _THIN * np.array([np.ptp(state["truth"]) for state in (x, y)])
+    return next((k for k in _ENLARGED if (k * largest >= least).all()), 1)
+
+
+def _ellipse(x: pd.Series[Any], y: pd.Series[Any], times: int = 1) -> Array:
+    """Returns points (2, 73) around a position that hold 95 % of its errors, so many times as far
+    from it."""
     covariance = np.array([[x["deviation"] ** 2, x["across"]], [x["across"], y["deviation"] ** 2]])
     if not np.isfinite(covariance).all():
         return np.full((2, 1), np.nan)
@@ -140,7 +170,7 @@ def _ellipse(x: pd.Series[Any], y: pd.Series[Any]) -> Array:
     turn = np.linspace(0, 2 * np.pi, 73)
     circle = np.array([np.cos(turn), np.sin(turn)])
     root = axes * np.sqrt(sizes.clip(min=0))
-    return np.array([[x["mean"]], [y["mean"]]]) + _ELLIPSE * root @ circle
+    return np.array([[x["mean"]], [y["mean"]]]) + times * _ELLIPSE * root @ circle
 
 
 FIGURES = (Figure(draw, ("one_track",), main=True),)
