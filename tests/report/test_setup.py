@@ -47,6 +47,10 @@ def test_the_velocities_are_multiples_of_the_step_and_their_errors_those_of_the_
     # A velocity swings at the Schuler period, 84.4 minutes; the errors are a hundredth of it.
     swung = 1500 * 0.3048 * np.cos(2 * np.pi * 3 / 84.4)
     assert points(read)[0, 0, 0] == pytest.approx(swung, rel=0.02)
+    # Cases at right angles read nearly the same: the dot of one is seen in the ring of the other.
+    dots, rings = (read.lines[axis::2] for axis in (0, 1))
+    assert {ring.get_markerfacecolor() for ring in rings} == {"none"}
+    assert max(dot.get_markersize() for dot in dots) < min(r.get_markersize() for r in rings)
     exact = np.array([line.get_ydata() for line in errors.lines if line.get_marker() != "o"])
     assert np.abs(exact.reshape(4, 2, 30) - z).max() <= STEP / 2 * (1 + 1e-9)
 

@@ -45,7 +45,7 @@ def draw(view: View) -> Iterator[Drawing]:
         f"Left: a stable platform on a bench that stands still; each case injects a velocity and"
         f" lasts {model.times[-1] / 60:.0f} minutes. Middle: the {model.m} velocities read. Right:"
         " their difference from a system without errors; lines: before read-out. Error scale"
-        f" {value_text(scenario.error_scale)}, trial 0. Filled: along x; hollow: along y.",
+        f" {value_text(scenario.error_scale)}, trial 0. Dots: along x; rings: along y.",
     )
 
 
@@ -84,8 +84,9 @@ def picture(model: Gins, z: Array, h: Array) -> Any:
     exact = h.reshape(shape)
     minutes = model.times / 60
     for case, color in zip(range(len(model.cases)), _COLORS, strict=False):
-        for axis, filled in ((0, color), (1, "white")):
-            points: Any = {"marker": "o", "markersize": 2.6, "linestyle": "none"}
+        # Cases at right angles read nearly the same velocities: a dot is seen within a ring.
+        for axis, filled, size in ((0, color, 2.2), (1, "none", 4.5)):
+            points: Any = {"marker": "o", "markersize": size, "linestyle": "none"}
             points |= {"color": color, "markerfacecolor": filled, "markeredgewidth": 0.8}
             axes[1].plot(minutes, velocities[case, :, axis], **points)
             axes[2].plot(minutes, errors[case, :, axis], **points)
@@ -107,7 +108,8 @@ def _draw_platform(ax: Any, model: Gins) -> None:
     ax.annotate("", (0.0, _REACH), (0.0, 0.0), arrowprops=axis)
     ax.annotate("x east", (_REACH, 0.0), (0, 5), ha="right", **letters)
     ax.annotate("y north", (0.0, _REACH), (0, 3), ha="center", **letters)
-    ax.annotate("z up", (0.0, 0.0), (-5, -8), ha="right", **letters)
+    # Above the arrow of the third case, so that none crosses it.
+    ax.annotate("z up", (0.0, 0.0), (-4, 12), ha="right", **letters)
     ax.plot(0, 0, "o", color=SOFT, markersize=3)
     feet = np.array(model.injected)
     for number, (velocity, color) in enumerate(zip(feet, _COLORS, strict=False), 1):
