@@ -19,11 +19,11 @@ whole path does not have."""
 
 OF_OWN = {
     "solver": ("auto", "newton"),
-    "baseline": ("levenberg_marquardt", "map_lm", "ekf", "ukf"),
+    "baseline": ("levenberg_marquardt", "multistart", "map_lm", "iterated_ekf", "iplf"),
     "tracker": ("auto", "ekf", "ukf", "ukf_rts"),
 }
-"""What `run` compares on data like a user's own: of constants three that take no prior, one of them
-IPE, and three that do."""
+"""What `run` compares on data like a user's own: of constants four that take no prior, two of them
+IPE, and three that do; the strongest of each family of stored experiments are among them."""
 
 
 @functools.cache

@@ -14,6 +14,7 @@ from make_docs import STORED
 
 import ipe_bench as ib
 from ipe_bench.basics.files import own_conf
+from ipe_bench.plugins.standard import OF_OWN
 from ipe_bench.report.finding import Finding
 from ipe_bench.statistics.records import family_of
 
@@ -69,16 +70,45 @@ def shown_runs(path: Path) -> list[str]:
     return re.findall(r"ipe-bench (run .*(?:solver|baseline|tracker)=\[.*)$", text, re.MULTILINE)
 
 
-@pytest.mark.parametrize("page", ["README.md", "ipe_bench/report/docs/pages/first_hour.md"])
-def test_a_command_that_compares_contains_the_strongest_of_each_family(page):
+PAGES = "ipe_bench/report/docs/pages"
+
+
+@pytest.mark.parametrize(
+    ("page", "number"),
+    [
+        ("README.md", 4),
+        (f"{PAGES}/first_hour.md", 2),
+        (f"{PAGES}/choosing.md", 1),
+        (f"{PAGES}/index.md", 0),
+    ],
+)
+def test_a_command_that_compares_contains_the_strongest_of_each_family(page, number):
     best = strongest("headline", "family")
     trackers = {*strongest("states", "given").values(), "iplf"}
     shown = shown_runs(ROOT / page)
-    assert len(shown) >= 2
+    assert len(shown) == number
     for words in shown:
         named = set(re.findall(r"\w+", " ".join(re.findall(r"=\[([^\]]*)\]", words))))
         wanted = trackers if "tracker=" in words else {best["least squares"], best["filters"]}
         assert named >= wanted, words
+
+
+def test_what_run_compares_on_own_data_contains_the_strongest_of_each_family():
+    """`ipe-bench run oxygen.py oxygen.csv`, on README and in the First hour."""
+    best = strongest("headline", "family")
+    constants = {*OF_OWN["solver"], *OF_OWN["baseline"]}
+    assert constants >= {*best.values(), "multistart", "map_lm", "iterated_ekf", "iplf"}
+    assert set(OF_OWN["tracker"]) >= {*strongest("states", "given").values()}
+
+
+@pytest.mark.parametrize("page", ["README.md", f"{PAGES}/first_hour.md"])
+def test_a_comparison_in_python_contains_the_strongest_of_each_family(page):
+    best = strongest("headline", "family")
+    text = (ROOT / page).read_text(encoding="utf-8")
+    compared = re.findall(r"^estimators = \{([^}]*)\}$", text, re.MULTILINE)
+    assert len(compared) == text.count("ib.run(")
+    for words in compared:
+        assert set(re.findall(r'"(\w+)":', words)) >= {best["least squares"], best["filters"]}
 
 
 def test_a_title_with_only_names_its_field():
