@@ -120,7 +120,7 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path, monkeypatch):
     names: dict = {}
     exec(code, names)
     del sys.modules["oxygen"]
-    assert set(names["table"]["estimator"]) == {"auto", "lm"}
+    assert set(names["table"]["estimator"]) == {"auto", "multistart", "iplf"}
     # As the command above it has answered, and R's nls.
     fit = names["fits"][0]
     assert fit.values == pytest.approx({"b1": 19.1426, "b2": 0.5311}, rel=1e-4)

@@ -105,8 +105,9 @@ def test_a_state_whose_band_is_seen_is_drawn_beside_the_truth():
         _, (ax,) = common.panels(1, {})
         one_track._draw_state(ax, pd.DataFrame(one), {"ekf": Look("red", "")})
     assert ax.get_title() == "angle [rad]"
-    np.testing.assert_allclose(ax.lines[0].get_ydata(), np.sin(at) + 0.1)
-    np.testing.assert_allclose(ax.lines[1].get_ydata(), np.sin(at))
+    path, truth = (np.asarray(line.get_ydata(), float) for line in ax.lines)
+    np.testing.assert_allclose(path, np.sin(at) + 0.1)
+    np.testing.assert_allclose(truth, np.sin(at))
 
 
 def test_an_ellipse_holds_95_percent_of_the_errors():
