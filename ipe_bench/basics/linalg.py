@@ -256,7 +256,7 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
         L = _of_each(np.linalg.cholesky, unit)
         U = L.swapaxes(1, 2)
         inverse_U = _inverse_of_upper(U)
-        condition = np.sqrt(np.sum(inverse_U**2, axis=(1, 2))) * np.sqrt(n)
+        condition = np.sqrt(n * (inverse_U**2).sum(axis=(1, 2)))
         well = usable & (condition <= _WELL_CONDITIONED)
         return U * size[:, None, :], inverse_U / size[:, :, None], well
 

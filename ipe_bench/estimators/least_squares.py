@@ -145,7 +145,7 @@ class NormalEquations:
             Q_there, U[ill], inverse_U[ill], gradient[ill] = _orthogonal_factors(J[ill], r[ill])
             if Q is not None:
                 Q[ill] = Q_there
-        columns = np.sqrt(np.sum(U**2, axis=1))
+        columns = np.sqrt((U**2).sum(axis=1))
         along = np.abs(multiply(U.swapaxes(1, 2), gradient))
         along_columns = along / divisors(columns)
         newton, size = _newton_step(inverse_U, gradient)
@@ -182,7 +182,7 @@ class NormalEquations:
 def _newton_step(inverse_U: Array, gradient: Array) -> tuple[Array, Array]:
     """Computes the Gauss-Newton step (trials, n), and its largest entry (trials,) in deviations."""
     newton = -multiply(inverse_U, gradient)
-    deviation = np.sqrt(np.sum(inverse_U**2, axis=2))
+    deviation = np.sqrt((inverse_U**2).sum(axis=2))
     size = np.abs(newton / deviation).max(axis=1)
     return newton, finite_or(np.inf, size)
 

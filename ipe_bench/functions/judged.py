@@ -157,7 +157,7 @@ class Judged:
         with np.errstate(all="ignore"):
             rough = self._roughness(x, here, J)
             beyond = ~(rough <= max(8 * _EPS, self.noise))
-            return np.any(np.isfinite(here) & beyond, axis=1)
+            return (np.isfinite(here) & beyond).any(axis=1)
 
     def _roughness(self, x: Array, here: Array, J: Array) -> Array:
         """Computes by which part of their terms the outputs (rows, m) move otherwise than slopes
@@ -177,6 +177,8 @@ class Judged:
         most = np.fmin(bend, 4 * bend**2 / np.abs(change))
         allowed = most + _SLOPES * np.abs(change)
         away = np.maximum(np.abs(change - moved) - allowed, 0.0)
+        if not away.any():
+            return away
         return np.where(away == 0.0, 0.0, away / self._size(x, here, J))
 
     def contradicted(self, x: Array, J: Array) -> Mask:

@@ -90,9 +90,9 @@ class CountingModel:
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
         """Computes dh/dx (trials, m, n) for the trials `rows` of the tally; of the trials `coarse`
         by `coarse_jacobian`, counted as what it costs beside an exact one."""
-        exact: Mask = ~np.broadcast_to(coarse, len(x))
-        if self.coarse_share == 1.0 or exact.all():
+        if self.coarse_share == 1.0 or not np.any(coarse):
             return self._jacobian(self.measurement.jacobian, 1.0, x, rows)
+        exact: Mask = ~np.broadcast_to(coarse, len(x))
         J = np.empty((len(x), self.measurement.m, self.measurement.n))
         J[~exact] = self._jacobian(
             self.measurement.coarse_jacobian, self.coarse_share, x[~exact], rows[~exact]
