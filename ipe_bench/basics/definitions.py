@@ -83,6 +83,14 @@ def definition_of(component: Any) -> Definition:
     return Definition(digest, frozenset(definitions.modules))
 
 
+def statement_of(component: Any) -> Any:
+    """Describes a component with its options; None if any of its code is not of an installed
+    package."""
+    definitions = Definitions()
+    described = definitions.of(component)
+    return None if definitions.modules else described
+
+
 def importable_digest(component: Any) -> str:
     """Computes a digest of the code that another process imports by name, whatever its variables
     hold."""

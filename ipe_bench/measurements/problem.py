@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -159,7 +159,9 @@ def _irregularity(model: Measurement, definition: str) -> str:
     rng = np.random.default_rng(11)
     x = read_only(model.nominal + 0.1 * rng.standard_normal((4, model.n)))
     other = read_only(model.nominal + 0.1 * rng.standard_normal((7, model.n)))
-    fresh: Any = replace(cast(Any, model)) if is_dataclass(model) else copy.copy(model)
+    fresh = copy.copy(model)
+    if is_dataclass(model):
+        fresh = replace(model)  # type: ignore[type-var]
     if component_classes(fresh) != component_classes(model):
         return "what its options name was defined anew since it was made; make the model anew"
     shapes: dict[str, tuple[int, ...]] = {"simulate": (len(x), model.m)}

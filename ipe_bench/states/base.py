@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ipe_bench.basics.definitions import statement_of
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, Mask, multiply, nearest
 from ipe_bench.basics.options import Component
@@ -220,10 +221,20 @@ class StateModel(Component, ABC):
     def recorded_numbers(self, name: str, epochs: Sequence[int]) -> Mapping[Any, Numbered]:
         """Returns, by what else is recorded, the epochs (e,) at which `transition` or `observe` is
         that, and their numbers (e, p)."""
+        stated = statement_of(self), epochs
+        before, found = self._recorded_as.get(name, (None, {}))
+        if stated[0] and stated == before:
+            return found
         found = {}
         for form, at in self._written(name, epochs).items():
             found[form] = Numbered(np.array([*at]), np.array([one.numbers for one in at.values()]))
+        self._recorded_as[name] = stated, found
         return found
+
+    @cached_property
+    def _recorded_as(self) -> Kept:
+        """The numbers of recorded functions, beside what the model stated by its options then."""
+        return Kept()
 
     def astray(self, x: Array) -> Mask:
         """Finds the trials (trials,) with paths x (trials, 1 + K, n) at which recorded functions

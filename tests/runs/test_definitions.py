@@ -16,7 +16,7 @@ import pytest
 
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt
-from ipe_bench.basics.definitions import Definitions
+from ipe_bench.basics.definitions import Definitions, statement_of
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements.problem import require_function
 from ipe_bench.noise import Gaussian
@@ -24,6 +24,7 @@ from ipe_bench.runs.execution import Processes, end_idle
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
 from ipe_bench.runs.store import ResultKey
+from ipe_bench.states.base import widened
 from ipe_bench.trials.fit_test import Spread, fit_probability
 
 # Ways to say how far estimates are shifted: the part of a cell that is edited, and the part that
@@ -613,3 +614,47 @@ def test_a_worker_that_imported_a_module_before_it_was_edited_does_not_compute_w
         found.append(ib.load(folder)["error_c0"].iloc[0])
     end_idle()
     assert found[1] == pytest.approx(found[0] + 1000)
+
+
+def test_a_packaged_model_states_its_options_and_not_what_it_has_worked_out():
+    model = ib.component("state_model/pendulum", count=5)
+    stated = statement_of(model)
+    ib.states.ekf().track(model, model.draw(0, 1).z)
+    assert statement_of(model) == stated
+    assert statement_of(dataclasses.replace(model)) == stated
+    wide = statement_of(widened(model, 2.0))
+    assert wide not in (None, stated, statement_of(widened(model, 3.0)))
+    object.__setattr__(model, "start", {"angle": 0.1})
+    assert statement_of(model) not in (None, stated)
+
+
+def test_a_model_of_a_file_states_nothing_for_sure():
+    @dataclasses.dataclass(frozen=True)
+    class Own(ib.states.WalkingGins):
+        pass
+
+    assert statement_of(Own()) is None
+
+
+def test_a_long_transition_is_recorded_again_only_where_its_model_has_changed(monkeypatch):
+    model = ib.states.WalkingGins(steps=1)
+    epochs = range(5)
+    written = []
+    record = ib.states.WalkingGins._written
+
+    def watched(self, *arguments):
+        written.append(self)
+        return record(self, *arguments)
+
+    monkeypatch.setattr(ib.states.WalkingGins, "_written", watched)
+    first = model.recorded_numbers("transition", epochs)
+    assert model.recorded_numbers("transition", epochs) is first
+    assert len(written) == 1
+    object.__setattr__(model.gins, "latitude_deg", 10.0)
+    again = model.recorded_numbers("transition", epochs)
+    assert len(written) == 2
+    fresh = ib.states.WalkingGins(steps=1, gins=ib.measurements.Gins(latitude_deg=10.0))
+    expected = fresh.recorded_numbers("transition", epochs)
+    assert again.keys() == expected.keys()
+    for form, found in again.items():
+        np.testing.assert_array_equal(found.numbers, expected[form].numbers)
