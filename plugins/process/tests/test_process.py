@@ -40,6 +40,18 @@ def require(language: str) -> None:
             pytest.skip(f"{tool} is not installed")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _none_is_left_running():
+    """Ends the programs that stay for a next block, before the interpreter finds them."""
+    yield
+    end_all()
+
+
+def end_all() -> None:
+    while process._running:
+        process._running.popitem()[1].end()
+
+
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory) -> Path:
     require("cpp")
@@ -199,8 +211,7 @@ def test_a_fault_costs_its_own_trial_and_a_line(fault):
     if fault in LINES:
         assert LINES[fault] in found.messages[BAD]
         assert list(found.messages) == [BAD]
-    while process._running:
-        process._running.popitem()[1].end()
+    end_all()
     assert none_is_left(fault)
 
 
