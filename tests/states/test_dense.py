@@ -151,8 +151,25 @@ def test_trackers_of_each_kind_are_exact_for_a_linear_model(model):
         assert error < 1e-8, name
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("model", CASES, ids=repr)
+LEVELS = ((1, 2, 3), (1, 2, 3), ("regular", "singular", "wide"), ("full", "thin", "none"))
+
+
+def in_the_third(model):
+    """Whether a model is one of the third of them in which any three features meet in all ways:
+    the levels of these four add up to a multiple of three."""
+    features = (model.n, model.m_of_epoch, model.spread, model.noise)
+    return sum(level.index(one) for level, one in zip(LEVELS, features, strict=True)) % 3 == 0
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param(
+            one, marks=pytest.mark.slow if in_the_third(one) else pytest.mark.campaign, id=repr(one)
+        )
+        for one in CASES
+    ],
+)
 def test_every_tracker_is_exact_for_every_linear_model(model):
     for name, error in beside_dense(model, TRACKERS):
         # The paper's estimator solves a dense system, of which wide priors take digits.
