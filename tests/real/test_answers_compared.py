@@ -252,15 +252,20 @@ def test_a_page_of_a_nonlinear_model_opens_with_the_intervals_that_it_recommends
     assert "±" in line.lead()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("truth", "least", "most"),
-    [({}, 490, 500), ({"factor": 2.0}, 0, 2), ({"beyond": CURVED, "factor": 0.4}, 0, 2)],
+    "number",
+    [pytest.param(150, marks=pytest.mark.slow), pytest.param(500, marks=pytest.mark.campaign)],
 )
-def test_titles_of_answers_are_false_as_seldom_as_their_tests_say(truth, least, most):
-    """Two tests at 1 in 1000 of readings by the model, or by none such."""
-    titles = [answered(0.3, **truth, seed=seed).finding() for seed in range(500)]
-    assert least <= sum("passes every test" in title for title in titles) <= most
+@pytest.mark.parametrize(
+    ("truth", "false"),
+    [({}, 0.02), ({"factor": 2.0}, 0.004), ({"beyond": CURVED, "factor": 0.4}, 0.004)],
+)
+def test_titles_of_answers_are_false_as_seldom_as_their_tests_say(truth, false, number):
+    """Two tests at 1 in 1000 of readings by the model, or by none such; one may be false by
+    chance."""
+    titles = [answered(0.3, **truth, seed=seed).finding() for seed in range(number)]
+    passes = sum("passes every test" in title for title in titles)
+    assert (passes if truth else number - passes) <= max(1, false * number)
 
 
 def far_overstated(deviation):

@@ -213,12 +213,21 @@ def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case, d
             )
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("trials", "least"),
+    [
+        pytest.param(150, 0.88, marks=pytest.mark.slow),
+        pytest.param(500, 0.93, marks=pytest.mark.campaign),
+    ],
+)
 @pytest.mark.parametrize("case", NOISES)
-def test_intervals_hold_the_truth_and_levels_have_no_bias(case):
+def test_intervals_hold_the_truth_and_levels_have_no_bias(case, trials, least):
+    """By 150 trials, of intervals that should hold 95 %, those that hold 80 % pass once in a
+    hundred times; by 500, those that hold 90 % do. The mean of a level's logarithm has a deviation
+    of 0.007 by 150 trials."""
     true = np.concatenate([[10.0, 0.9, 0.3], NOISES[case][1]])
     held, excess = np.zeros(5), []
-    for seed in range(500):
+    for seed in range(trials):
         z = readings(case, seed)
         one = fitted(case, z)
         low, high = one.interval()
@@ -231,7 +240,7 @@ def test_intervals_hold_the_truth_and_levels_have_no_bias(case):
             mean = [digamma(v / 2) - np.log(v / 2) for v in (f, 30.0)]
             excess.append(np.log(one.x[3:] ** 2 / about) - (mean[0] - mean[1]))
     assert (held[3:] == 0).all()
-    assert (held[:3] >= 0.93 * 500).all(), held
+    assert (held[:3] >= least * trials).all(), held
     if excess:
         assert np.abs(np.mean(excess, axis=0)).max() < 0.02
 

@@ -453,8 +453,13 @@ def test_figures_of_questions_tell_all_apart(kind, tmp_path):
     assert list(faults_of_question(kind, 1, tmp_path)) == []
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(20))
+def some_of(seeds):
+    """A quarter of the draws; the others wait for a campaign."""
+    marks = [pytest.mark.slow if i % 4 == 0 else pytest.mark.campaign for i in range(len(seeds))]
+    return [pytest.param(seed, marks=mark) for seed, mark in zip(seeds, marks, strict=True)]
+
+
+@pytest.mark.parametrize("seed", some_of(range(20)))
 @pytest.mark.parametrize("kind", [audited, compared, designed, posteriors])
 def test_figures_of_many_questions_tell_all_apart(kind, seed, tmp_path):
     assert list(faults_of_question(kind, seed, tmp_path)) == []
@@ -465,8 +470,7 @@ def test_what_is_shown_counts_every_trial(seed):
     assert list(faults(seed)) == []
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(100, 130))
+@pytest.mark.parametrize("seed", some_of(range(100, 130)))
 def test_what_is_drawn_counts_every_trial(seed):
     assert list(faults(seed, drawn=True)) == []
 

@@ -184,7 +184,7 @@ def test_the_exact_density_leaves_no_second_path_open():
 @pytest.mark.slow
 def test_on_growth_the_answer_is_that_of_the_grid_at_less_than_the_price_of_particles():
     table = ib.run(
-        Growth(), {"auto": AutoTracker(), "grid": Grid(), "bootstrap": Bootstrap()}, trials=60
+        Growth(), {"auto": AutoTracker(), "grid": Grid(), "bootstrap": Bootstrap()}, trials=20
     )
     rows = table[table["parameter"] == "all"].set_index("estimator")
     assert rows.loc["auto", "success"] == rows.loc["grid", "success"]

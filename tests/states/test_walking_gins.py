@@ -51,7 +51,7 @@ def test_trackers_of_singular_covariances_are_calibrated():
     """The motion follows from the parameters after each first reading of a run: ranks of 11 to 22
     of 22."""
     table = ib.run(
-        StateScenario(WalkingGins(gins=Gins(readings_per_case=4)), error_scale=10.0), TRACKERS, 12
+        StateScenario(WalkingGins(gins=Gins(readings_per_case=2)), error_scale=10.0), TRACKERS, 12
     )
     rows = table[table["parameter"] == "all"].set_index("estimator")
     assert (rows["converged"] == 1).all()

@@ -465,11 +465,14 @@ def test_the_title_says_what_is_decided(tmp_path):
     assert false_titles(tmp_path, 5) == (2, 0)
 
 
-@pytest.mark.slow
-def test_the_title_is_false_in_few_comparisons(tmp_path):
-    """Of 300 pairs 180 differ by nothing, or by less than the margin."""
-    claims, false = false_titles(tmp_path, 300)
-    assert claims >= 120
+@pytest.mark.parametrize(
+    "pairs",
+    [pytest.param(100, marks=pytest.mark.slow), pytest.param(300, marks=pytest.mark.campaign)],
+)
+def test_the_title_is_false_in_few_comparisons(tmp_path, pairs):
+    """Of all pairs 60 % differ by nothing, or by less than the margin."""
+    claims, false = false_titles(tmp_path, pairs)
+    assert claims >= 0.4 * pairs
     assert false <= 0.05 * claims
 
 
