@@ -11,6 +11,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -40,7 +41,7 @@ from ipe_bench.report.paper import with_columns
 from ipe_bench.report.style import BLACK, BOUND_COLOR, GREY, house_style
 from ipe_bench.report.tables.matrix import MATRIX, Matrix, opening
 from ipe_bench.report.tables.reports import all_tables
-from ipe_bench.report.tables.table import Table, latex, markdown
+from ipe_bench.report.tables.table import Table, html, latex, markdown
 from ipe_bench.report.tables.terminal import summary_tables
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.intervals import EXCLUDED, VAGUE
@@ -141,21 +142,60 @@ def alike_rows(analysis: Analysis) -> Iterator[str]:
         else:
             keys = [column for column in table.columns if column.title in KEYS]
         rows = zip(*(column.cells for column in keys), strict=True)
-        texts = [tuple(cell.text for cell in row) for row in rows]
-        if len(set(texts)) < len(texts):
+        if twice(tuple(cell.text for cell in row) for row in rows):
             yield f"{table.name}: rows look alike"
         if not readable(latex(table)):
             yield f"{table.name}: LaTeX or siunitx cannot read it"
+            continue
+        for kind, (head, *body) in written(table):
+            places = [i for i, title in enumerate(head) if title in KEYS] or [0]
+            if twice(tuple(row[i] for i in places) for row in body):
+                yield f"{table.name}: rows look alike in {kind}"
         if isinstance(table, Matrix) or len(titles) < 4:
             continue
         # A choice of columns keeps what tells rows apart, in LaTeX and Markdown.
         chosen = with_columns(table, [re.sub(r"[^a-z0-9]+", "_", titles[-1].lower()).strip("_")])
-        lines = [line for line in markdown(chosen).splitlines() if line.startswith("|")][2:]
-        names = [line.rsplit("|", 2)[0] for line in lines]
-        if len(set(names)) < len(names):
+        if twice(tuple(row[:-1]) for row in in_markdown(chosen)[1:]):
             yield f"{table.name}: rows of an export look alike"
         if "inf" in re.sub(r"\\num\{[^}]*\}", "", latex(chosen)).replace(r"\infty", ""):
             yield f"{table.name}: inf in LaTeX"
+
+
+class _Rows(HTMLParser):
+    """Collects the texts of the cells of a page, row by row."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[list[str]] = []
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.rows and self.rows[-1]:
+            self.rows[-1][-1] += data.strip()
+
+
+def in_page(table: Table) -> list[list[str]]:
+    parser = _Rows()
+    parser.feed(html([table]))
+    return parser.rows
+
+
+def in_markdown(table: Table) -> list[list[str]]:
+    lines = [line for line in markdown(table).splitlines() if re.match(r"\|(?!:?-)", line)]
+    rows = [re.split(r"(?<!\\)\|", line)[1:-1] for line in lines]
+    return [[cell.strip(" *") for cell in row] for row in rows]
+
+
+def written(table: Table) -> Iterator[tuple[str, list[list[str]]]]:
+    """Yields the rows of a table, the titles first, as they stand in each format."""
+    yield "a page", in_page(table)
+    yield "Markdown", in_markdown(table)
+    yield "LaTeX", read(latex(table))
 
 
 def readable(text: str) -> bool:
@@ -199,6 +239,8 @@ def helped_in_figures(was: Analysis, now: Analysis, label: str, scale: float) ->
     for analysis, shown in ((was, first), (now, second)):
         for drawing in shown.values():
             yield from alike_in(drawing)
+        if twice(drawing.title for drawing in shown.values()):
+            yield "titles of figures look alike"
         yield from cut_where_it_falls(shown, analysis)
     for name in first.keys() & second.keys():
         axes = zip(first[name].figure.axes, second[name].figure.axes, strict=False)
@@ -407,6 +449,39 @@ def compared(rng: np.random.Generator, folder: Path) -> Iterable[Any]:
                 scenario = store.scenario(error_scale=scale)
                 store.add(scenario, label, errors, simulations=float(rng.integers(1, 50)))
     return draw_pairs(ib.compare(folder / "a", folder / "b"))
+
+
+def faults_of_comparison(seed: int, folder: Path) -> Iterator[str]:
+    """Yields whether tables of a comparison look alike, and verdicts that their numbers deny."""
+    with patch(f"{__name__}.draw_pairs", lambda frame: frame):
+        frame: Any = compared(np.random.default_rng([seed, 3]), folder)
+    tables = [part for part in frame.parts() if isinstance(part, Table)]
+    if twice(table.title for table in tables):
+        yield "comparisons look alike"
+    if sum(map(len, tables)) != len(frame):
+        yield "a comparison is missing"
+    for table in tables:
+        if any(twice(row[0] for row in rows[1:]) for _, rows in written(table)):
+            yield "rows of a comparison look alike"
+    for row in frame.to_dict("records"):
+        more_is_better = row["quantity"] == "success"
+        same = 0.0 if more_is_better or "bias" in row["quantity"] else 1.0
+        rises, falls = row["low"] > same, row["high"] < same
+        if row["low"] > row["change"] or row["change"] > row["high"]:
+            yield "a change lies outside its interval"
+        if row["finding"] and not row["different"]:
+            yield "a finding without a difference"
+        if row["quantity"] not in ("success", "error", "cost"):
+            continue
+        if row["finding"] == "better" and not (rises if more_is_better else falls):
+            yield "better is not read from the interval"
+        if row["finding"] == "worse" and not (falls if more_is_better else rises):
+            yield "worse is not read from the interval"
+
+
+@pytest.mark.parametrize("seed", slow_if(lambda seed: seed > 1, range(20)))
+def test_tables_of_comparisons_tell_all_apart_and_verdicts_follow_their_numbers(seed, tmp_path):
+    assert list(faults_of_comparison(seed, tmp_path)) == []
 
 
 def designed(rng: np.random.Generator, folder: Path) -> Iterable[Any]:
