@@ -31,6 +31,9 @@ states a period apart are then 6.7 standard deviations apart at most, and both m
 _POINTS = 200
 """Points of the grid of an epoch at least; as many take half a millisecond a trial of 20 epochs, a
 fine one may take a second."""
+_WORK = 1e7
+"""Products of points and points and epochs of a trial up to which finer grids are taken, too: some
+20 ms. Models that need more are so precise that their posteriors are nearly those of tangents."""
 _STRAIGHT = 1e-9
 """Part by which slopes of a straight line differ at most."""
 
@@ -52,7 +55,7 @@ def exact_tracks(
     """Returns the tracks of a grid of those trials whose readings are folded among the states that
     the extended filter predicts, if a grid is exact for them, and which trials these are; readings
     beyond a quantile `gate` are missing. `of_all` asks for all trials of a model that is not
-    straight and for which `_POINTS` are enough."""
+    straight and whose grid is no work."""
     if not may_fold(model):
         return Tracks.empty(model, 0), np.arange(0)
     is_open = folded(model, filtered)
@@ -61,7 +64,7 @@ def exact_tracks(
         is_open[:] = True
     if of_all and not straight(model, filtered):
         grid = grid_of(model, smooths)
-        is_open |= grid is not None and grid.points == _POINTS
+        is_open |= grid is not None and _is_little_work(grid, model)
     rows = np.flatnonzero(is_open)
     grid = grid_of(model, smooths) if rows.size else None
     if grid is None:
@@ -75,6 +78,10 @@ def grid_of(model: StateModel, smooths: bool = True) -> Grid | None:
     """Returns the grid that is exact for a model; None if none is."""
     grid = Grid(_POINTS, smooths).fitting(model)
     return grid if isinstance(grid, Grid) else None
+
+
+def _is_little_work(grid: Grid, model: StateModel) -> bool:
+    return grid.points == _POINTS or grid.points**2 * model.epochs <= _WORK
 
 
 def _tracked(grid: Grid, model: StateModel, z: Array) -> Tracks:

@@ -164,7 +164,8 @@ class PathBlock:
     def gates(self, smooths: bool) -> Array:
         """The variances (trials, K, n) against which errors are held: of a scalar state those of
         each trial's exact posterior, which no linear bound describes where the reading is folded,
-        unless a grid would be very fine and the reading is not folded; else of the bound."""
+        unless a grid would take longer than trackers do and the reading is not folded; else of the
+        bound."""
         if smooths not in self._gates:
             self._gates[smooths] = self._gates_of(smooths)
         return self._gates[smooths]
