@@ -8,6 +8,8 @@ import io
 import re
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -29,7 +31,7 @@ from ipe_bench.questions.design.answer import _draw_design, _findings, _ways
 from ipe_bench.questions.posterior.figure import draw_marginals
 from ipe_bench.questions.posterior.maths import Posterior, Reference
 from ipe_bench.real.logs import Constant
-from ipe_bench.report.figures.answers import _drawn, _left_out, draw_fit
+from ipe_bench.report.figures.answers import _abscissa, _drawn, _left_out, draw_fit
 from ipe_bench.report.figures.common import full_ticks, text
 from ipe_bench.report.figures.log import draw_log
 from ipe_bench.report.figures.views import looks_of, views
@@ -485,3 +487,15 @@ def test_of_many_readings_some_are_drawn_and_the_caption_says_which():
     assert _left_out(20_000) == ""
     assert _drawn(50_000).sum() == 16_667
     assert "Drawn: 1 of 3 of 50,000 readings" in _left_out(50_000)
+
+
+@pytest.mark.parametrize(
+    ("column", "name"),
+    [([1.0, 2, 4, 7, 8], "t"), ([8.0, 7, 4, 2, 1], "reading"), ([1.0] * 5 + [2] * 5, "reading")],
+    ids=["rises", "falls", "cases"],
+)
+def test_readings_stand_at_their_times_and_numbers_of_cases_are_no_times(column, name):
+    model: Any = SimpleNamespace(m=len(column), index={"t": column})
+    at, words = _abscissa(model)
+    assert words == name
+    assert list(at) == (column if name == "t" else list(range(1, len(column) + 1)))

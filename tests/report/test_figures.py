@@ -292,6 +292,12 @@ def test_scales_are_labelled_as_far_as_there_is_room_with_both_ends():
         )
     assert kept == scales
     assert common.labelled([33.0], 1.0) == [33.0]
+    with house_style():
+        _, (ax,) = common.panels(1, {})
+        common.scale_axis(ax, scales)
+    low, high = ax.get_xlim()
+    # As far from one end as from the other, on a logarithmic axis.
+    assert low * high == pytest.approx(scales[0] * scales[-1])
     shown = {
         0.0: "0",
         1e-3: "0.001",
@@ -695,6 +701,9 @@ def test_digits_of_each_problem_are_in_its_cell_dark_from_four_on_the_hardest_fi
     # From eight digits on it is darkest.
     assert fills.count(RAMP[20]) == 1
     assert "good solves 100 %" in drawing.caption
+    # A page that chooses no figures has it.
+    (shown,) = (one for one in certified.FIGURES if one.draw is certified.draw_digits)
+    assert shown.main
 
 
 def test_published_errors_are_rings_about_those_that_are_found():

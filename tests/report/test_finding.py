@@ -65,6 +65,11 @@ def test_who_holds_longest_is_named_with_the_scale_up_to_which():
     )
 
 
+def test_scales_ascend_in_whichever_order_a_folder_has_them():
+    rows = sweep(a=(200, 198, 0), b=(200, 100, 0))
+    assert found(rows[::-1]) == found(rows)
+
+
 def test_all_hold_and_more_than_three_are_counted():
     assert found(sweep(a=(200,) * 3, b=(196,) * 3)) == (
         "a and b succeed up to error scale 100 (98 to 100 % of 200 trials)"

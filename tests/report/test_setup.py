@@ -35,6 +35,14 @@ def test_the_velocities_are_multiples_of_the_step_and_their_errors_those_of_the_
     np.testing.assert_array_equal(corners.sum(axis=0) - corners[0], [0.0, 0.0])
     assert len({tuple(np.abs(corner)) for corner in corners}) == 1
 
+    # Its words stand within its panel.
+    drawing.figure.draw_without_rendering()
+    panel = above.get_window_extent()
+    for text in above.texts:
+        box = text.get_window_extent()
+        assert panel.x0 <= box.x0 < box.x1 <= panel.x1, text
+        assert panel.y0 <= box.y0 < box.y1 <= panel.y1, text
+
     def points(ax):
         lines = [line.get_ydata() for line in ax.lines if line.get_marker() == "o"]
         return np.array(lines).reshape(4, 2, 30)

@@ -56,6 +56,9 @@ def test_letters_are_ten_pixels_high_on_a_phone_and_nothing_is_cut():
         box = text.get_window_extent()
         assert box.x0 >= 0, text
         assert box.x1 <= figure.bbox.x1, text
+        assert 0 <= box.y0 <= box.y1 <= figure.bbox.y1, text
+    # The curves begin below the title.
+    assert ax.get_window_extent().y1 < min(text.get_window_extent().y0 for text in figure.texts)
 
 
 @pytest.mark.parametrize("dark", [False, True])

@@ -10,6 +10,7 @@ from shared.state_models import ConstantVelocity
 
 import ipe_bench as ib
 from ipe_bench.real.logs import far_below
+from ipe_bench.report.tables.reports import all_tables
 from ipe_bench.report.tables.table import plain_text
 from ipe_bench.report.tables.terminal import overview_notes, summary_tables
 from ipe_bench.states import Formulas, Smoother, ekf, ukf
@@ -54,6 +55,19 @@ def test_every_row_says_its_verdict_on_any_screen(synthetic):
         (row,) = (line for line in narrow.splitlines() if line.lstrip().startswith("newton "))
         assert f" {sign} " in row
         assert f"{sign} {word}" in " ".join(overview_notes((), narrow=True))
+    # Innovations have a column of their own.
+    assert "not white" not in " ".join(overview_notes((), narrow=True))
+
+
+def test_shares_of_parameters_are_in_percent_and_words_are_no_numbers(synthetic):
+    """Errors of a tenth of a deviation or less: each interval of 95 % holds the truth."""
+    synthetic.add(synthetic.scenario(), "newton", np.full((20, 3), 0.01))
+    tables = {table.name: table for table in all_tables(analyse([synthetic.directory]))}
+    columns = {column.title: column for column in tables["parameters"].columns}
+    assert {cell.text for cell in columns["coverage"].cells} == {"100 %"}
+    assert not columns["calibration"].numeric
+    (words,) = (one for one in tables["calibration"].columns if one.title == "verdict")
+    assert not words.numeric
 
 
 def test_a_log_whose_innovations_are_not_white_is_wrong_however_small_they_are():

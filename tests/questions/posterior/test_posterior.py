@@ -17,6 +17,7 @@ from ipe_bench.measurements import Gins
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.questions.posterior.answer import (
     CHANCE,
+    SAME_LAW,
     adequate_word,
     finding,
     sampled,
@@ -139,6 +140,15 @@ def test_what_is_adequate_allows_for_chance_and_not_for_more(kl, noise, word):
     sampled_ones: Any = SimpleNamespace(modes=[0], noise=noise)
     one: Any = SimpleNamespace(kl=kl, energy=0.0)
     assert adequate_word(one, sampled_ones) == word
+
+
+def test_a_gaussian_of_the_right_moments_is_not_adequate_for_another_law():
+    sampled_ones: Any = SimpleNamespace(modes=[0], noise=0.0)
+    found: list[Any] = [
+        SimpleNamespace(kl=0.0, energy=energy) for energy in (0.0, 0.5 * SAME_LAW, 2 * SAME_LAW)
+    ]
+    words = [adequate_word(one, sampled_ones) for one in found]
+    assert words == ["yes", "yes", "NO"]
 
 
 def test_a_page_says_nothing_of_posteriors_whose_populations_differ(tmp_path):
