@@ -183,7 +183,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 if it is right."
         " The interval, by bets and by the studentised bootstrap, has 95 % for all estimators and"
         " error scales of a setting together; its upper end is the largest factor of the variance"
-        " that these trials do not exclude. The verdict is read from it.",
+        " that these trials do not exclude. The verdict is read from it. It knows nothing of rare"
+        " large errors that no trial shows.",
         lambda s: f.claimed(s).mean,
         limits=lambda s: (f.claimed(s).low, f.claimed(s).high),
         where=("calibration",),

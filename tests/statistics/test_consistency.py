@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import brentq
 from shared.oracles import assert_agrees
 
-from ipe_bench.statistics.intervals import mean_limits, verdict
+from ipe_bench.statistics.intervals import mean_limits, mean_nees, verdict
 from ipe_bench.trials.scoring import nees
 
 
@@ -101,6 +101,39 @@ def verdicts(
         values = np.sum((noise(rng, (trials, m)) @ Q) ** 2, axis=1) / claimed**2
         found.append(verdict(values, n))
     return {word: found.count(word) / studies for word in set(found)}
+
+
+def nees_misses(noise, n: int, trials: int, studies: int) -> float:
+    """How often the interval of the mean NEES does not hold 1, which it is; of a law with errors
+    that are ten times larger, in studies that show three of them."""
+    rng = np.random.default_rng([n, trials, 5])
+    held = []
+    while len(held) < studies:
+        size = np.ones(trials)
+        if noise is contaminated:
+            size = np.where(rng.random(trials) < 0.05, 10.0, 1.0) / np.sqrt(0.95 + 5)
+        if noise is student:
+            size = np.sqrt(3 / rng.chisquare(5, trials))
+        if noise is contaminated and (size > 1).sum() < 3:
+            continue
+        found = mean_nees(size**2 * rng.chisquare(n, trials), n)
+        held.append(found.low <= 1 <= found.high)
+    return 1 - float(np.mean(held))
+
+
+@pytest.mark.parametrize("noise", [normal, student, contaminated])
+def test_the_interval_of_the_mean_nees_holds_it_whatever_the_law_of_errors_that_are_seen(noise):
+    assert nees_misses(noise, 3, 40, 150) <= 0.05 + 2 * np.sqrt(0.05 * 0.95 / 150)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("trials", [40, 100, 200])
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("noise", [normal, student, contaminated])
+def test_1000_intervals_of_the_mean_nees_hold_it(noise, n, trials):
+    share = nees_misses(noise, n, trials, 1000)
+    print(f"{noise.__name__}, n {n}, {trials} trials: missed {share:.1%}")
+    assert share <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 1000)
 
 
 def false_alarms(found: dict[str, float]) -> float:

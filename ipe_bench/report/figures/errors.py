@@ -22,8 +22,8 @@ CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_mean": 30.0}
 """Errors beyond are drawn here: the size of a diverged error carries no information, and the bound
 needs the room."""
 BARS = (
-    "Bars: 95 % intervals of success and of the mean NEES, errors from the median to the 95 %"
-    " quantile."
+    "Bars: 95 % intervals of success and, for errors like those seen, of the mean NEES; errors"
+    " from the median to the 95 % quantile."
 )
 _ALONG = " Success and NEES: at the last time step. Error: over all time steps."
 _NEES = ("nees_mean_low", "nees_mean_high")
