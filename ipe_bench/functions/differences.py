@@ -1,15 +1,23 @@
 """Slopes by differences that know their error, and what they say of other slopes.
 
-Steps shrink by a ratio of 3 from the widest; central differences and those of either side are
-extrapolated three times. A function takes rows (rows, n) and returns rows (rows, m), and each row
-is differentiated by itself.
+A function takes rows (rows, n) and returns rows (rows, m), and each row is differentiated by
+itself. Along a direction, a caller's *widest step*, there is a *ladder* of steps, each a third of
+the one before. Every step gives three differences: central ones, and those of either side, ahead
+and behind. Each of the three is extrapolated to a step of 0, up to three times. The extrapolated
+value of the least error is the slope; the error is what is left after the noise of the function's
+values, after what finer steps move, and after the sides, where these disagree with the central
+ones.
+
+Slopes are per widest step, unless a function says otherwise: by how much outputs would change if
+they went on as straight lines to the end of that step.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -23,34 +31,28 @@ Near = Callable[[Array, Array], Array]
 
 LEVELS = 9
 """Steps of a ladder."""
+RATIO = 3.0
+"""How many times a step of the ladder is as wide as the next."""
+TOLERANCE = 1e-6
+"""Part of a slope by which a right one may differ, beside the error of the differences."""
+TELLING = 1e-2
+"""Part of a slope up to which the error of differences lets them say that it is right."""
+SMALL = 1e-3
+"""Part of the largest slope of an output below which no slope counts as smaller."""
+# What differences say of a slope.
+RIGHT = 0
+UNKNOWN = 1
+WRONG = 2
 _EPS = np.finfo(float).eps
-_RATIO = 3.0
 _COLUMNS = 3
 """Extrapolations of the differences of each step."""
 _QUICK = (3, 4, 8)
 """Steps of the ladder whose differences are believed if they agree."""
-_BESIDE = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-"""Places of neighbours of a point, by which its noise is known, in parts of the finest step."""
-_TOLERANCE = 1e-6
-"""Part of a slope by which a right one may differ, beside the error of the differences."""
-_SMALL = 1e-3
-"""Part of the largest slope of an output below which no slope counts as smaller."""
 _QUICKLY = 1e-7
 """Part of a slope by which three steps may disagree."""
-_TELLING = 1e-2
-"""Part of a slope up to which the error of differences lets them say that it is right."""
-_ROUGHLY = 1e-4
-"""Part of a slope by which the sides of a step of a rough function may differ from it."""
-_OTHERS = (27.0, 1.0 / 9.0)
-"""Multiples of such steps that are tried where their sides disagree."""
-_CLOSELY = 1e-7
-"""Part of the largest slope to which steps are as good as wider ones."""
-_USUALLY = 10.0
-"""Multiple of what the sides of a step differ at points that are tried, up to which it is believed
-elsewhere."""
-_NEARLY_ALL = 0.9
-"""Share of the slopes that a step must find which is used in place of the ladder."""
-RIGHT, UNKNOWN, WRONG = 0, 1, 2
+_BESIDE = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+"""Places of neighbours of a point, by which its noise is known, in thirds of the finest step."""
+_NOWHERE = np.empty(0)
 
 
 def unmoved(values: Array, to: Array) -> Array:
@@ -73,151 +75,23 @@ class Measured(NamedTuple):
     behind: Limit
 
 
-class Moved(NamedTuple):
-    """Holds what a function does along directions, by steps of some levels of the ladder."""
-
-    here: Array
-    """The values (rows, 1, m)."""
-    up: Array
-    """The values ahead (levels, rows, p, m)."""
-    down: Array
-    """The values behind, likewise."""
-    ahead: Array
-    """The steps ahead as they are in floating point (levels, rows, p, 1), in parts of the
-    direction."""
-    behind: Array
-    """Likewise."""
-    beside: Array
-    """The values of neighbours (6, rows, p, m)."""
-
-
 def measured(
     h: Rows, x: Array, directions: Array, near: Near = unmoved, levels: int = LEVELS
 ) -> Measured:
     """Differentiates h at x (rows, n) along directions (rows, p, n), which are the widest steps, in
     one call of h."""
-    parts = _RATIO ** -np.arange(levels)
-    with np.errstate(all="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        moved = _moved(h, x, directions, near, parts, _BESIDE * parts[-1] / 3)
-        here, up, down, ahead, behind, _ = moved
-        size = np.maximum(np.abs(here), np.maximum(np.abs(up), np.abs(down)))
-        coarse = 2 * _resolution(moved) * size
-        noise = np.fmax(coarse, 3 * _scatter(here, moved.beside)) / ahead
-        # A step that is a few units of round-off of what it moves is no step along the direction.
-        moving = np.where(directions != 0, np.abs(x)[:, None], 0.0).max(axis=2)
-        widest = np.abs(directions).max(axis=2)
-        blur = (_EPS * moving / widest)[:, :, None] / ahead
-        sides = (
-            ((up - down) / (ahead + behind), 2),
-            ((up - here) / ahead, 1),
-            ((here - down) / behind, 1),
-        )
-        limits = [_limit(C, noise + np.abs(C) * blur, order) for C, order in sides]
-        limits[0] = _settled(*limits)
-    return Measured(*(Limit(one.slope.swapaxes(1, 2), one.error.swapaxes(1, 2)) for one in limits))
-
-
-def _moved(h: Rows, x: Array, directions: Array, near: Near, parts: Array, beside: Array) -> Moved:
-    """Computes h at x, at parts of the directions ahead and behind, and at other parts beside."""
-    rows, p, n = directions.shape
-    steps = parts[:, None, None, None] * directions
-    above = x[:, None] + steps
-    below = x[:, None] - steps
-    neighbours = x[:, None] + beside[:, None, None, None] * directions
-    each = (x, neighbours, above, below)
-    points = np.concatenate([one.reshape(-1, n) for one in each])
-    values = np.asarray(h(points), dtype=float)
-    ends = np.cumsum([one.size // n for one in each])[:-1]
-    here, near_by, up, down = np.split(values, ends)
-    here = here[:, None]
-
-    def placed(given: Array, count: int) -> Array:
-        shaped = given.reshape(count, rows, p, values.shape[1])
-        return near(shaped, np.broadcast_to(here, shaped.shape))
-
-    length = np.abs(directions).sum(axis=2)
-    ahead = np.abs(above - x[:, None]).sum(axis=3) / length
-    behind = np.abs(below - x[:, None]).sum(axis=3) / length
-    return Moved(
-        here,
-        placed(up, len(parts)),
-        placed(down, len(parts)),
-        ahead[..., None],
-        behind[..., None],
-        placed(near_by, len(beside)),
-    )
-
-
-def _resolution(moved: Moved) -> Array:
-    """Returns the relative distance (rows, p, m) of neighbouring values: that of single precision
-    where all that move have no more digits."""
-    here, up, down = moved.here, moved.up, moved.down
-    short = single(here) & single(up).all(axis=0) & single(down).all(axis=0)
-    moves = (up != here).any(axis=0) | (down != here).any(axis=0)
-    return np.where(short & moves, np.finfo(np.float32).eps, _EPS)
-
-
-def single(values: Array) -> Mask:
-    """Tells of each value whether it has no more digits than single precision holds."""
-    with np.errstate(all="ignore"):
-        return values == values.astype(np.float32)
-
-
-def _scatter(here: Array, beside: Array) -> Array:
-    """Estimates the noise (rows, p, m) of values, by high differences of neighbours, which smooth
-    functions lack (More and Wild, SIAM J. Sci. Comput. 33, 2011)."""
-    line = np.concatenate([beside[:3], np.broadcast_to(here, beside[:1].shape), beside[3:]])
-    fourth = np.diff(line, 4, axis=0) / math.sqrt(70)
-    fifth = np.diff(line, 5, axis=0) / math.sqrt(252)
-    return np.sqrt(np.maximum((fourth**2).mean(axis=0), (fifth**2).mean(axis=0)))
-
-
-def _settled(central: Limit, ahead: Limit, behind: Limit) -> Limit:
-    """Believes the sides where they agree and central differences do not agree with them: the error
-    of these is not even in the step where the curvature jumps."""
-    mean = (ahead.slope + behind.slope) / 2
-    error = np.maximum(ahead.error, behind.error)
-    smooth = np.abs(ahead.slope - behind.slope) <= 3 * (ahead.error + behind.error)
-    sides = smooth & (error < np.abs(central.slope - mean))
-    return Limit(np.where(sides, mean, central.slope), np.where(sides, error, central.error))
-
-
-def _limit(C: Array, noise: Array, order: int) -> Limit:
-    """Extrapolates differences C (levels, ...) of shrinking steps, each with its noise, whose error
-    is of that order and its multiples."""
-    moved = np.abs(np.diff(C, axis=0))
-    # What moves beyond noise from each step to finer ones, at the most.
-    beyond = moved - 3 * (noise[:-1] + noise[1:])
-    later = np.fmax.accumulate(beyond[::-1], axis=0)[::-1]
-    best = C[-1]
-    least = np.full(C.shape[1:], np.inf)
-    column = C
-    noisy = noise
-    error = np.concatenate([np.full((1, *C.shape[1:]), np.inf), moved])
-    for k in range(_COLUMNS + 1):
-        if k:
-            gain = _RATIO ** (order * k)
-            finer = column[1:] + (column[1:] - column[:-1]) / (gain - 1.0)
-            apart = np.abs(finer - column[:-1]) / gain
-            error = np.maximum(np.abs(finer - column[1:]), apart)
-            noisy = noisy[1:] * (1 + 2 / (gain - 1.0))
-            column = finer
-        for i in range(len(column)):
-            level = len(C) - len(column) + i
-            here = error[i] + noisy[i]
-            # Wide steps say nothing of a function that moves more at finer ones, or elsewhere.
-            if 0 < level < len(moved):
-                used = moved[max(0, level - k - 1) : level].max(axis=0)
-                here = np.where(later[level] > used, np.maximum(here, later[level]), here)
-            if level + 1 < len(moved):
-                away = np.abs(column[i] - C[level + 1 : -1])
-                allowed = 2 * moved[level + 1 :] + 3 * noise[level + 1 : -1]
-                here = np.maximum(here, np.fmax.reduce(away - allowed, axis=0))
-            better = here < least
-            best = np.where(better, column[i], best)
-            least = np.where(better, here, least)
-    return Limit(best, least)
+    parts = RATIO ** -np.arange(levels)
+    with silent():
+        found = sampled(h, x, directions, near, parts, _BESIDE * parts[-1] / 3)
+        noise = _noise(found)
+        blur = _blur(x, directions) / found.ahead
+        limits = []
+        # The error of a central difference is even in the step, that of a side is not.
+        for C, order in ((found.central, 2), (found.forward, 1), (found.backward, 1)):
+            limits.append(_limit(C, noise + np.abs(C) * blur, order))
+        central, ahead, behind = limits
+        central = _settled(central, ahead, behind)
+    return Measured(*map(_by_output, (central, ahead, behind)))
 
 
 def judge(J: Array, found: Measured) -> NDArray[np.int8]:
@@ -227,108 +101,20 @@ def judge(J: Array, found: Measured) -> NDArray[np.int8]:
     with np.errstate(all="ignore"):
         size = np.maximum(np.abs(J), np.abs(central.slope))
         largest = np.where(np.isfinite(size), size, 0.0).max(axis=2, keepdims=True)
-        size = np.maximum(size, _SMALL * largest)
-        allowed = _TOLERANCE * size
-        sides = ahead.error + behind.error
-        reach = 3 * sides + allowed
+        size = not_small(size, largest)
+        tolerance = TOLERANCE * size
+        reach = 3 * (ahead.error + behind.error) + tolerance
         kink = np.abs(ahead.slope - behind.slope) > reach
         # At a kink any slope between those of the sides is right.
         low = np.minimum(ahead.slope, behind.slope) - reach
         high = np.maximum(ahead.slope, behind.slope) + reach
-        close = np.abs(J - central.slope) <= 3 * central.error + allowed
-        right = np.isfinite(J) & np.where(kink, (low <= J) & (high >= J), close)
-        telling = kink | (central.error <= _TELLING * size + 1e-300)
+        between = (low <= J) & (high >= J)
+        close = np.abs(J - central.slope) <= 3 * central.error + tolerance
+        right = np.isfinite(J) & np.where(kink, between, close)
+        telling = kink | (central.error <= TELLING * size + 1e-300)
         known = np.isfinite(central.error)
     verdict = np.where(right & telling, RIGHT, UNKNOWN)
     return np.where(known & ~right, WRONG, verdict).astype(np.int8)
-
-
-def along_units(scale: Array, rows: int) -> Array:
-    """Returns the directions (rows, n, n) of each number, with its widest step."""
-    return np.broadcast_to(np.diag(scale), (rows, len(scale), len(scale)))
-
-
-class Steps(NamedTuple):
-    """Holds steps of central differences for a function that is rougher than round-off."""
-
-    widths: Array
-    """(n,)"""
-    apart: Array
-    """By how much the slopes (m, n) of either side may differ from the central ones."""
-
-
-def steps_of_a_rough_function(h: Rows, x: Array, scale: Array, near: Near) -> Steps | None:
-    """Finds the steps by which central differences find at the first and most others of the points
-    x (rows, n) what the whole ladder finds, to its error; None if there are none."""
-    units = along_units(scale, len(x))
-    parts = _RATIO ** -np.arange(LEVELS)
-    found = measured(h, x, units, near).central
-    with np.errstate(all="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        slope, apart = _sided(_moved(h, x, units, near, parts, np.empty(0)))
-        size = np.abs(found.slope)
-        largest = size.max(axis=2, keepdims=True)
-        allowed = 3 * found.error + _TOLERANCE * np.maximum(size, _SMALL * largest)
-        away = np.abs(slope - found.slope)
-        # Per point and level, beside the largest slope of all outputs.
-        worst = (away / size.max(axis=1, keepdims=True)).max(axis=2)
-        usual = np.median(np.where(np.isfinite(worst), worst, np.inf), axis=1)
-        # The narrowest of good steps meets the fewest jumps and kinks.
-        narrowest = len(usual) - 1 - np.argmax(usual[::-1] <= _CLOSELY, axis=0)
-        good = (usual <= _CLOSELY).any(axis=0)
-        best = np.where(good, narrowest, np.argmin(usual, axis=0))
-        each = np.arange(len(scale))
-        # A ladder that does not settle, as on a function that jumps everywhere, tells of no step.
-        telling = found.error <= _TELLING * largest
-        right = (away[best, :, :, each] <= allowed.transpose(2, 0, 1)) & telling.transpose(2, 0, 1)
-        right |= ~np.isfinite(found.slope).transpose(2, 0, 1)
-        known = np.isfinite(usual[best, each]).all()
-        nearly = (right.mean(axis=2) >= _NEARLY_ALL).all(axis=0)
-        if not known or not nearly[0] or 2 * nearly.sum() <= len(x):
-            return None
-        apart = apart[best, :, :, each]
-        apart = np.median(np.where(np.isfinite(apart), apart, 0.0), axis=1).T
-        widths = scale * parts[best]
-        return Steps(widths, _USUALLY * apart / scale)
-
-
-def by_steps(h: Rows, x: Array, steps: Steps, near: Near) -> Array:
-    """Computes dh/dx (rows, m, n) at x (rows, n) by a central difference of those steps; where its
-    sides disagree, by a wider or narrower one if its sides agree better."""
-    slope, apart = _by_widths(h, x, steps.widths, near)
-    with np.errstate(all="ignore"):
-        size = np.abs(slope)
-        size = np.maximum(size, _SMALL * size.max(axis=2, keepdims=True))
-        allowed = np.maximum(steps.apart, _ROUGHLY * size)
-        rows = np.flatnonzero((~(apart <= allowed)).any(axis=(1, 2)))
-    for part in _OTHERS if rows.size else ():
-        other, by = _by_widths(h, x[rows], part * steps.widths, near)
-        better = ~(apart[rows] <= by) & np.isfinite(by)
-        slope[rows] = np.where(better, other, slope[rows])
-        apart[rows] = np.where(better, by, apart[rows])
-    return slope
-
-
-def _by_widths(h: Rows, x: Array, widths: Array, near: Near) -> tuple[Array, Array]:
-    """Returns slopes (rows, m, n) by steps, and by how much those of each side differ from them."""
-    with np.errstate(all="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        units = along_units(widths, len(x))
-        slope, apart = _sided(_moved(h, x, units, near, np.ones(1), np.empty(0)))
-        return slope[0] / widths, apart[0] / widths
-
-
-def _sided(moved: Moved) -> tuple[Array, Array]:
-    """Returns central differences (levels, rows, m, p) by the steps of each level, and by how much
-    those of each side differ from them: more than by the bend at a jump or a kink."""
-    ahead = (moved.up - moved.here) / moved.ahead
-    behind = (moved.here - moved.down) / moved.behind
-    return _central(moved), np.abs(ahead - behind).swapaxes(2, 3) / 2
-
-
-def _central(moved: Moved) -> Array:
-    """Returns central differences (levels, rows, m, p) by the steps of each level."""
-    return ((moved.up - moved.down) / (moved.ahead + moved.behind)).swapaxes(2, 3)
 
 
 def by_differences(
@@ -347,40 +133,258 @@ def by_differences(
 def quick(h: Rows, x: Array, scale: Array, near: Near = unmoved) -> tuple[Array, Array]:
     """Returns slopes (rows, m, n) per widest step by three steps of the ladder, and by which part
     of an output's slopes these disagree at the most (rows, n)."""
-    parts = _RATIO ** -np.array(_QUICK, dtype=float)
-    with np.errstate(all="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        moved = _moved(h, x, along_units(scale, len(x)), near, parts, np.empty(0))
-        here, up, down, ahead, _, _ = moved
-        C = _central(moved)
-        slope = C[1] + (C[1] - C[0]) / (_RATIO**2 - 1.0)
-        size = np.maximum(np.abs(here), np.maximum(np.abs(up), np.abs(down))).max(axis=0)
-        noise = (4 * _resolution(moved) * size / ahead[-1]).swapaxes(1, 2)
+    parts = RATIO ** -np.array(_QUICK, dtype=float)
+    with silent():
+        found = sampled(h, x, along_units(scale, len(x)), near, parts)
+        C = found.central.swapaxes(2, 3)
+        wide, narrow, finest = C
+        slope = narrow + (narrow - wide) / (RATIO**2 - 1.0)
+        size = found.size.max(axis=0)
+        noise = (4 * _resolution(found) * size / found.ahead[-1]).swapaxes(1, 2)
         # The finest step finds what the wide ones step over.
-        apart = np.abs(slope - C[2]) - noise
+        apart = np.abs(slope - finest) - noise
         # What is extrapolated is no better than a part of its last correction.
-        apart = np.maximum(apart, _QUICKLY * np.abs(slope - C[1]) / _SMALL)
+        correction = np.abs(slope - narrow)
+        apart = np.maximum(apart, _QUICKLY * correction / SMALL)
         largest = np.abs(slope).max(axis=2, keepdims=True)
-        apart = apart / np.maximum(np.abs(slope), _SMALL * largest)
+        apart = apart / not_small(np.abs(slope), largest)
         still = (C == 0.0).all(axis=0)
         return slope, np.where(still, 0.0, apart).max(axis=1)
 
 
+def along_units(scale: Array, rows: int) -> Array:
+    """Returns the directions (rows, n, n) of each number, with its widest step."""
+    n = len(scale)
+    return np.broadcast_to(np.diag(scale), (rows, n, n))
+
+
+def single(values: Array) -> Mask:
+    """Tells of each value whether it has no more digits than single precision holds."""
+    with np.errstate(all="ignore"):
+        return values == values.astype(np.float32)
+
+
+@contextlib.contextmanager
+def silent() -> Iterator[None]:
+    """Leaves out warnings: a function may be asked outside of where it is defined."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def not_small(size: Array, largest: Array) -> Array:
+    """Returns sizes of slopes, none of them small beside the largest of its output."""
+    return np.maximum(size, SMALL * largest)
+
+
+class Sampled(NamedTuple):
+    """Holds the values of a function at steps along directions, level by level of a ladder, and
+    next to where it begins."""
+
+    here: Array
+    """The values (rows, 1, m)."""
+    up: Array
+    """The values ahead (levels, rows, p, m)."""
+    down: Array
+    """The values behind, likewise."""
+    ahead: Array
+    """The steps ahead as they are in floating point (levels, rows, p, 1), in parts of the
+    direction."""
+    behind: Array
+    """Likewise."""
+    beside: Array
+    """The values of neighbours (neighbours, rows, p, m)."""
+
+    @property
+    def central(self) -> Array:
+        """Central differences (levels, rows, p, m)."""
+        return (self.up - self.down) / (self.ahead + self.behind)
+
+    @property
+    def forward(self) -> Array:
+        """Differences of the side ahead, likewise."""
+        return (self.up - self.here) / self.ahead
+
+    @property
+    def backward(self) -> Array:
+        """Differences of the side behind, likewise."""
+        return (self.here - self.down) / self.behind
+
+    @property
+    def size(self) -> Array:
+        """The largest magnitude of the values at each step (levels, rows, p, m)."""
+        moved = np.maximum(np.abs(self.up), np.abs(self.down))
+        return np.maximum(np.abs(self.here), moved)
+
+
+def sampled(
+    h: Rows,
+    x: Array,
+    directions: Array,
+    near: Near,
+    parts: Array,
+    beside: Array = _NOWHERE,
+) -> Sampled:
+    """Computes h at x, at `parts` of the directions ahead and behind, and at other parts `beside`,
+    in one call."""
+    rows, p, n = directions.shape
+    steps = parts[:, None, None, None] * directions
+    begin = x[:, None]
+    above = begin + steps
+    below = begin - steps
+    neighbours = begin + beside[:, None, None, None] * directions
+    places = (x, neighbours, above, below)
+    points = np.concatenate([one.reshape(-1, n) for one in places])
+    values = np.asarray(h(points), dtype=float)
+    ends = np.cumsum([one.size // n for one in places])
+    value, of_neighbours, up, down = np.split(values, ends[:-1])
+    here = value[:, None]
+
+    def placed(given: Array, count: int) -> Array:
+        shaped = given.reshape(count, rows, p, values.shape[1])
+        return near(shaped, np.broadcast_to(here, shaped.shape))
+
+    # x + step is rounded: the step that was taken is what is left of it after taking off x.
+    length = np.abs(directions).sum(axis=2)
+    ahead = np.abs(above - begin).sum(axis=3) / length
+    behind = np.abs(below - begin).sum(axis=3) / length
+    return Sampled(
+        here,
+        placed(up, len(parts)),
+        placed(down, len(parts)),
+        ahead[..., None],
+        behind[..., None],
+        placed(of_neighbours, len(beside)),
+    )
+
+
+def _noise(found: Sampled) -> Array:
+    """Estimates by how much the noise of the values moves differences (levels, rows, p, m)."""
+    rounding = 2 * _resolution(found) * found.size
+    scatter = 3 * _scatter(found.here, found.beside)
+    return np.fmax(rounding, scatter) / found.ahead
+
+
+def _resolution(found: Sampled) -> Array:
+    """Returns the relative distance (rows, p, m) of neighbouring values: that of single precision
+    where all that move have no more digits."""
+    here, up, down, *_ = found
+    short = single(here) & single(up).all(axis=0) & single(down).all(axis=0)
+    moves = (up != here).any(axis=0) | (down != here).any(axis=0)
+    return np.where(short & moves, np.finfo(np.float32).eps, _EPS)
+
+
+def _scatter(here: Array, beside: Array) -> Array:
+    """Estimates the noise (rows, p, m) of values, by high differences of neighbours, which smooth
+    functions lack (More and Wild, SIAM J. Sci. Comput. 33, 2011)."""
+    middle = np.broadcast_to(here, beside[:1].shape)
+    line = np.concatenate([beside[:3], middle, beside[3:]])
+    # The squares of the coefficients of these differences add up to 70 and to 252.
+    fourth = np.diff(line, 4, axis=0) / math.sqrt(70)
+    fifth = np.diff(line, 5, axis=0) / math.sqrt(252)
+    return np.sqrt(np.maximum((fourth**2).mean(axis=0), (fifth**2).mean(axis=0)))
+
+
+def _blur(x: Array, directions: Array) -> Array:
+    """Returns the round-off (rows, p, 1) of the numbers that a direction moves, in parts of it: a
+    step of a few such units is no step along the direction."""
+    moving = np.where(directions != 0, np.abs(x)[:, None], 0.0).max(axis=2)
+    widest = np.abs(directions).max(axis=2)
+    return (_EPS * moving / widest)[:, :, None]
+
+
+class _Column(NamedTuple):
+    """Holds differences that are extrapolated so many times, one for each step but the widest."""
+
+    value: Array
+    error: Array
+    """What is left of the error, by how far the last extrapolation moved them."""
+    noise: Array
+
+
+def _columns(C: Array, noise: Array, order: int) -> Iterator[_Column]:
+    """Yields differences C (levels, ...) as they are, then extrapolated once, twice, three times
+    (Richardson). Their error is a series in the step to the power of `order`, of which each
+    extrapolation takes off a term."""
+    none = np.full((1, *C.shape[1:]), np.inf)
+    column = _Column(C, np.concatenate([none, np.abs(np.diff(C, axis=0))]), noise)
+    yield column
+    for k in range(1, _COLUMNS + 1):
+        gain = RATIO ** (order * k)
+        wide = column.value[:-1]
+        narrow = column.value[1:]
+        value = narrow + (narrow - wide) / (gain - 1.0)
+        error = np.maximum(np.abs(value - narrow), np.abs(value - wide) / gain)
+        grown = column.noise[1:] * (1 + 2 / (gain - 1.0))
+        column = _Column(value, error, grown)
+        yield column
+
+
+def _limit(C: Array, noise: Array, order: int) -> Limit:
+    """Extrapolates differences C (levels, ...) of shrinking steps, each with its noise, and takes
+    the value of the least error."""
+    moved = np.abs(np.diff(C, axis=0))
+    # What moves beyond noise from each step to finer ones, at the most.
+    beyond = moved - 3 * (noise[:-1] + noise[1:])
+    later = np.fmax.accumulate(beyond[::-1], axis=0)[::-1]
+    best = C[-1]
+    least = np.full(C.shape[1:], np.inf)
+    for k, column in enumerate(_columns(C, noise, order)):
+        for i, value in enumerate(column.value):
+            # The value is made of the steps from level i to level i + k.
+            finest = i + k
+            error = column.error[i] + column.noise[i]
+            # Wide steps say nothing of a function that moves more at finer ones, or elsewhere.
+            if 0 < finest < len(moved):
+                used = moved[max(0, i - 1) : finest].max(axis=0)
+                unseen = later[finest]
+                error = np.where(unseen > used, np.maximum(error, unseen), error)
+            # Nor is a value right from which the differences of finer steps stay away.
+            after = finest + 1
+            if after < len(moved):
+                away = np.abs(value - C[after:-1])
+                allowed = 2 * moved[after:] + 3 * noise[after:-1]
+                error = np.maximum(error, np.fmax.reduce(away - allowed, axis=0))
+            better = error < least
+            best = np.where(better, value, best)
+            least = np.where(better, error, least)
+    return Limit(best, least)
+
+
+def _settled(central: Limit, ahead: Limit, behind: Limit) -> Limit:
+    """Believes the sides where they agree and central differences do not agree with them: the error
+    of these is not even in the step where the curvature jumps."""
+    mean = (ahead.slope + behind.slope) / 2
+    error = np.maximum(ahead.error, behind.error)
+    smooth = np.abs(ahead.slope - behind.slope) <= 3 * (ahead.error + behind.error)
+    sides = smooth & (error < np.abs(central.slope - mean))
+    slope = np.where(sides, mean, central.slope)
+    return Limit(slope, np.where(sides, error, central.error))
+
+
+def _by_output(one: Limit) -> Limit:
+    """Turns slopes (rows, p, m) into slopes (rows, m, p), as Jacobians are."""
+    return Limit(one.slope.swapaxes(1, 2), one.error.swapaxes(1, 2))
+
+
 def _by_ladders(h: Rows, x: Array, scale: Array, near: Near) -> Array:
+    """Computes slopes (rows, m, n) per widest step by the whole ladder, and where it leaves an
+    error by a second ladder, which begins near the end of the first."""
     directions = along_units(scale, len(x))
     first = measured(h, x, directions, near).central
     slope = first.slope.copy()
     with np.errstate(all="ignore"):
         size = np.abs(slope)
         largest = np.fmax.reduce(size, axis=2, keepdims=True)
-        settled = first.error <= _TOLERANCE * np.maximum(size, _SMALL * largest)
+        settled = first.error <= TOLERANCE * not_small(size, largest)
         rows = np.flatnonzero(~settled.all(axis=(1, 2)))
         if rows.size:
-            part = _RATIO ** (LEVELS - 2)
+            part = RATIO ** (LEVELS - 2)
             second = measured(h, x[rows], directions[rows] / part, near).central
             finer = part * second.slope
             error = part * second.error
             # A second round must agree with the first within its error.
             agrees = ~(np.abs(finer - slope[rows]) > 3 * first.error[rows])
-            slope[rows] = np.where(agrees & (error < first.error[rows]), finer, slope[rows])
+            better = agrees & (error < first.error[rows])
+            slope[rows] = np.where(better, finer, slope[rows])
     return slope

@@ -16,16 +16,14 @@ from ipe_bench.functions.differences import (
     WRONG,
     Near,
     Rows,
-    Steps,
     along_units,
     by_differences,
-    by_steps,
     judge,
     measured,
     quick,
-    steps_of_a_rough_function,
     unmoved,
 )
+from ipe_bench.functions.rough import Steps, by_steps, steps_of_a_rough_function
 
 _EPS = np.finfo(float).eps
 _COMPLEX_STEP = 1e-100

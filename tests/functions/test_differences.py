@@ -5,13 +5,12 @@ import numpy as np
 from ipe_bench.functions.differences import (
     WRONG,
     along_units,
-    by_steps,
     judge,
     measured,
-    steps_of_a_rough_function,
     unmoved,
 )
 from ipe_bench.functions.judged import Judged, same_values
+from ipe_bench.functions.rough import by_steps, steps_of_a_rough_function
 
 
 def test_a_coordinate_blurs_the_slopes_along_itself_alone():

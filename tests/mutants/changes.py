@@ -227,8 +227,8 @@ CHANGES = {
     "wide-steps": Change(
         "functions",
         "wide differences step over what narrow ones find",
-        "apart = np.abs(slope - C[2]) - noise",
-        "apart = 0.0 * np.abs(slope - C[2])",
+        "apart = np.abs(slope - finest) - noise",
+        "apart = 0.0 * np.abs(slope - finest)",
         "test_judged.py test_constants.py",
     ),
     "copied-functions": Change(

@@ -40,7 +40,7 @@ class Vectors:
             for i in places
         ]
 
-    def store(self, values: Sequence[Value], frame: Value, places: Iterable[int]) -> None:
+    def store(self, values: Sequence[Value], frame: Value, places: Iterable[int | Value]) -> None:
         for value, i in zip(values, places, strict=True):
             self.builder.store(value, self.place(frame, i), align=8 * self.width)
 
