@@ -48,7 +48,7 @@ _COLUMNS = 3
 """Extrapolations of the differences of each step."""
 _QUICK = (3, 4, 8)
 """Steps of the ladder whose differences are believed if they agree."""
-_QUICKLY = 1e-7
+QUICKLY = 1e-7
 """Part of a slope by which three steps may disagree."""
 _BESIDE = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
 """Places of neighbours of a point, by which its noise is known, in thirds of the finest step."""
@@ -118,7 +118,7 @@ def judge(J: Array, found: Measured) -> NDArray[np.int8]:
 
 
 def by_differences(
-    h: Rows, x: Array, scale: Array, near: Near = unmoved, within: float = _QUICKLY
+    h: Rows, x: Array, scale: Array, near: Near = unmoved, within: float = QUICKLY
 ) -> Array:
     """Computes dh/dx (rows, m, n) at x (rows, n) by differences whose widest steps are `scale`
     (n,): by three steps where these agree `within` a part, else by the whole ladder, and there by a
@@ -145,7 +145,7 @@ def quick(h: Rows, x: Array, scale: Array, near: Near = unmoved) -> tuple[Array,
         apart = np.abs(slope - finest) - noise
         # What is extrapolated is no better than a part of its last correction.
         correction = np.abs(slope - narrow)
-        apart = np.maximum(apart, _QUICKLY * correction / SMALL)
+        apart = np.maximum(apart, QUICKLY * correction / SMALL)
         largest = np.abs(slope).max(axis=2, keepdims=True)
         apart = apart / not_small(np.abs(slope), largest)
         still = (C == 0.0).all(axis=0)

@@ -1,17 +1,25 @@
-"""A user's function whose slopes are held against differences wherever they are used."""
+"""A user's function whose slopes are held against differences wherever they are used.
+
+Slopes by complex steps are exact where a function is analytic, and wrong without a word where it
+is not, as at np.abs. So at every point where they are used they are tried in two stages. Two more
+values, along one direction that moves all numbers, tell what slopes should have told; that costs
+little, and leaves a doubt where it does not agree. Only in doubt are differences taken along each
+number by itself, which find slopes wrong (a *contradiction*), and take their place.
+"""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, read_only
+from ipe_bench.functions.complex_steps import by_complex_steps
 from ipe_bench.functions.differences import (
+    QUICKLY,
     RIGHT,
     WRONG,
     Near,
@@ -26,51 +34,24 @@ from ipe_bench.functions.differences import (
 from ipe_bench.functions.rough import Steps, by_steps, steps_of_a_rough_function
 
 _EPS = np.finfo(float).eps
-_COMPLEX_STEP = 1e-100
-_AT_ONCE = 16384
-"""Bytes of slopes that are computed in a call of a function by complex steps."""
-_NARROW = 1e-3
-"""Part of the widest steps by which slopes are tried along one direction."""
-_BESIDE_A_KINK = 1e-3
-"""Part of the widest steps from which on they are narrow."""
+_TINY = np.finfo(float).tiny
 _VALUES = 1e-10
 """Part of the size of an output's terms by which values may differ that are the same."""
-_SLOPES = 1e-6
-"""Part of a change along that direction by which slopes may differ without a doubt."""
 _MIXED = 1e-6
 """The same, of a row alone and among others."""
-_QUICKLY = 1e-7
-"""Part of a slope by which few differences may disagree in a smooth function, at the least."""
-_ROUGH = 1e-2
-"""The same at the most, in one that is rough, such as by an integrator's tolerance."""
-_NOISIEST = 1e-5
-"""Part of an output's terms by which a function may be rough."""
-_PARTS = 3.0 ** -np.arange(0.0, 16.0, 3.0)
-"""Parts of rough widest steps that are tried."""
-_NARROWER = 3.0**-9
-_MANY_LEVELS = 20
+_NARROW = 1e-3
+"""Part of the widest steps by which slopes are tried along one direction."""
+_SLOPES = 1e-6
+"""Part of a change along that direction by which slopes may differ without a doubt."""
 _LEAST = 1e-4
 """Part of the largest slope below which no slope counts as smaller in that direction."""
-
-
-def by_complex_steps(h: Rows, x: Array) -> Array:
-    """Computes dh/dx (rows, m, n) of an analytic function as Im h(x + i eps e_k) / eps, exact to
-    round-off (Squire and Trapp, SIAM Review 40, 1998)."""
-    rows, n = x.shape
-    # A few rows in a call: NumPy multiplies complex numbers with other rounding where it reuses a
-    # large temporary array for the product, so in one call of all the bits of each would depend on
-    # how many there are.
-    parts: list[Array] = []
-    begun = 0
-    few = 1
-    steps = np.eye(n) * _COMPLEX_STEP * 1j
-    while begun < rows or not parts:
-        points = x[begun : begun + few, None, :] + steps
-        moved = np.imag(h(read_only(points.reshape(-1, n))))
-        parts.append(moved.reshape(len(points), n, moved.shape[-1]).swapaxes(1, 2))
-        begun += few
-        few = max(1, int(_AT_ONCE / max(parts[0][:1].nbytes, 1)))
-    return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP
+_BESIDE_A_KINK = 1e-3
+"""Part of the widest steps from which on they are narrow."""
+_ROUGH = 1e-2
+"""Part of a slope by which few differences may disagree at the most, in a function that is rough,
+such as by an integrator's tolerance; `QUICKLY` at the least, in a smooth one."""
+_NOISIEST = 1e-5
+"""Part of an output's terms by which a function may be rough."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +67,7 @@ class Judged:
     """Why its slopes are differences; empty if complex steps are tried."""
     noise: float = 0.0
     """Part of an output's terms by which it is rougher than round-off."""
-    within: float = _QUICKLY
+    within: float = QUICKLY
     """Part of a slope by which few differences may disagree."""
     steps: Steps | None = None
     """Steps of differences if the function is rough, such as by an integrator's tolerance."""
@@ -100,7 +81,7 @@ class Judged:
         if self.why:
             return value, self.differences(x)
         try:
-            J = self._by_complex_steps(x)
+            J = self.complex_slopes(x)
         except Exception:  # functions of `math` and many of SciPy take no complex numbers
             return value, self.differences(x)
         rows = np.flatnonzero(self._wrong_slopes(x, value, J))
@@ -108,12 +89,15 @@ class Judged:
             J[rows] = self.differences(x[rows])
         return value, J
 
-    def _by_complex_steps(self, x: Array) -> Array:
+    def complex_slopes(self, x: Array) -> Array:
+        """Computes slopes (rows, m, n) by complex steps, believed or not; a function that takes no
+        complex numbers raises what it likes."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", np.exceptions.ComplexWarning)
             return by_complex_steps(self.function, x)
 
     def differences(self, x: Array) -> Array:
+        """Computes slopes (rows, m, n) by the differences that suit the function."""
         if self.steps is not None:
             return by_steps(self.function, x, self.steps, self.near)
         return by_differences(self.function, x, self.scale, self.near, self.within)
@@ -121,15 +105,17 @@ class Judged:
     @property
     def differences_cost(self) -> float:
         """Calls of a row's differences, but where they doubt themselves."""
-        return float((6 if self.steps is None else 2) * len(self.scale) + 1)
+        each = 6 if self.steps is None else 2
+        return float(each * len(self.scale) + 1)
 
     def wrong(self, x: Array, value: Array, J: Array) -> Mask:
         """Finds the rows (rows,) of x whose values or slopes are not the function's own."""
         with np.errstate(all="ignore"):
             here = np.asarray(self.function(x), dtype=float)
-            alike = np.abs(self.near(value, here) - here) <= _VALUES * self._size(x, here, J)
-            both = ~np.isfinite(value) & ~np.isfinite(here)
-            wrong: Mask = np.any(~(alike | both), axis=1)
+            allowed = _VALUES * self._terms(x, here, J)
+            alike = np.abs(self.near(value, here) - here) <= allowed
+            missing = ~np.isfinite(value) & ~np.isfinite(here)
+            wrong: Mask = np.any(~(alike | missing), axis=1)
             right = np.flatnonzero(~wrong)
             wrong[right] = self._wrong_slopes(x[right], here[right], J[right])
         return wrong
@@ -143,41 +129,41 @@ class Judged:
             wrong[rows] = self.contradicted(x[rows], J[rows])
         return wrong
 
-    def _size(self, x: Array, here: Array, J: Array) -> Array:
-        """Returns the size (rows, m) of the terms of the outputs, which may be larger than
-        these."""
-        terms = np.abs(J) * (self.scale + np.abs(x))[:, None]
-        return np.abs(here) + np.where(np.isfinite(terms), terms, 0.0).sum(axis=2)
-
     def _doubted(self, x: Array, here: Array, J: Array) -> Mask:
         """Finds the rows (rows,) of x where slopes do not tell what the function, whose values are
         `here`, does along one direction."""
         with np.errstate(all="ignore"):
-            rough = self._roughness(x, here, J)
+            rough = self.roughness(x, here, J)
             beyond = ~(rough <= max(8 * _EPS, self.noise))
             return (np.isfinite(here) & beyond).any(axis=1)
 
-    def _roughness(self, x: Array, here: Array, J: Array) -> Array:
-        """Computes by which part of their terms the outputs (rows, m) move otherwise than slopes
-        tell."""
-        per_step = np.abs(J) * self.scale
-        per_step = np.where(np.isfinite(per_step), per_step, 0.0)
-        along = _NARROW * self.scale * _direction(per_step)
-        z = np.asarray(self.function(np.concatenate([x + along, x - along])), dtype=float)
-        up = z[: len(x)]
-        down = z[len(x) :]
-        moved = (J * along[:, None]).sum(axis=2)
+    def roughness(self, x: Array, here: Array, J: Array) -> Array:
+        """Computes by which part of their terms the outputs (rows, m), which are `here`, move
+        otherwise along one direction than slopes tell."""
+        along = _NARROW * self.scale * _direction(_finite(np.abs(J) * self.scale))
+        points = np.concatenate([x + along, x - along])
+        values = np.asarray(self.function(points), dtype=float)
+        up = values[: len(x)]
+        down = values[len(x) :]
         ahead = self.near(up, here) - here
         behind = self.near(down, here) - here
         change = (ahead - behind) / 2
         bend = np.abs(ahead + behind) / 2
+        told = (J * along[:, None]).sum(axis=2)
         # A difference of one step is off by about its bend squared, but at kinks.
-        most = np.fmin(bend, 4 * bend**2 / np.abs(change))
-        allowed = most + _SLOPES * np.abs(change)
-        away = np.maximum(np.abs(change - moved) - allowed, 0.0)
+        curved = np.fmin(bend, 4 * bend**2 / np.abs(change))
+        allowed = curved + _SLOPES * np.abs(change)
+        away = np.maximum(np.abs(change - told) - allowed, 0.0)
         if not away.any():
             return away
-        return np.where(away == 0.0, 0.0, away / self._size(x, here, J))
+        part = away / self._terms(x, here, J)
+        return np.where(away == 0.0, 0.0, part)
+
+    def _terms(self, x: Array, here: Array, J: Array) -> Array:
+        """Returns the size (rows, m) of the terms of the outputs, which may be larger than the
+        outputs: of x - y, for one, that of x and of y."""
+        sizes = (self.scale + np.abs(x))[:, None]
+        return np.abs(here) + _finite(np.abs(J) * sizes).sum(axis=2)
 
     def contradicted(self, x: Array, J: Array) -> Mask:
         """Finds the rows (rows,) of x with a slope that differences along each number find wrong,
@@ -186,39 +172,34 @@ class Judged:
         wrong = self._verdicts(x, J, 1.0) == WRONG
         rows = np.flatnonzero(wrong.any(axis=(1, 2)))
         if rows.size:
-            wrong[rows] &= self._verdicts(x[rows], J[rows], _BESIDE_A_KINK) != RIGHT
+            by_narrow_ones = self._verdicts(x[rows], J[rows], _BESIDE_A_KINK)
+            wrong[rows] &= by_narrow_ones != RIGHT
         return wrong.any(axis=(1, 2))
 
     def _verdicts(self, x: Array, J: Array, part: float) -> Array:
-        directions = along_units(part * self.scale, len(x))
-        found = measured(self.function, x, directions, self.near)
+        """Says what differences, of a part of the widest steps, find of slopes (rows, m, n)."""
+        widest = part * self.scale
+        found = measured(self.function, x, along_units(widest, len(x)), self.near)
         with np.errstate(all="ignore"):
-            return judge(J * (part * self.scale), found)
+            return judge(J * widest, found)
 
 
 def _direction(per_step: Array) -> Array:
     """Returns parts (rows, n) of the widest steps by which every number changes the outputs by
     about as much, none by a multiple of what another does, so that a wrong column shows beside
-    larger ones."""
+    larger ones; `per_step` is the size of the slopes (rows, m, n) per widest step."""
     n = per_step.shape[2]
-    largest = per_step.max(axis=1, initial=0.0) + np.finfo(float).tiny
-    weight = 1.0 / np.maximum(largest, _LEAST * largest.max(axis=1, keepdims=True))
+    effect = per_step.max(axis=1, initial=0.0) + _TINY
+    least = _LEAST * effect.max(axis=1, keepdims=True)
+    weight = 1.0 / np.maximum(effect, least)
     return weight / weight.max(axis=1, keepdims=True) * _signed_parts(n)
 
 
 @cache
 def _signed_parts(n: int) -> Array:
-    """Returns numbers (n,) from .5 to 1 of both signs, always the same."""
+    """Returns numbers (n,) from 0.5 to 1 of both signs, always the same."""
     rng = np.random.default_rng(1)
     return read_only(rng.uniform(0.5, 1.0, n) * rng.choice([-1.0, 1.0], n))
-
-
-def same_values(a: Array, b: Array) -> bool:
-    """Tells whether values (rows, m) are the same to round-off of the largest of their row."""
-    with np.errstate(all="ignore"):
-        size = np.abs(np.where(np.isfinite(b), b, 0.0)).max(axis=1, keepdims=True)
-        alike = (np.abs(a - b) <= _VALUES * size) | (a == b) | (np.isnan(a) & np.isnan(b))
-        return bool(alike.all())
 
 
 def with_differences(function: Rows, points: Array, scale: Array, near: Near = unmoved) -> Judged:
@@ -227,7 +208,9 @@ def with_differences(function: Rows, points: Array, scale: Array, near: Near = u
         # How far few differences may disagree is what they do there.
         apart = quick(function, points, scale, near)[1].max(axis=1)
         usual = float(np.median(np.where(np.isfinite(apart), apart, np.inf)))
-        within = min(max(_QUICKLY, 3 * usual), _ROUGH) if usual < _ROUGH else _QUICKLY
+        within = QUICKLY
+        if usual < _ROUGH:
+            within = min(max(QUICKLY, 3 * usual), _ROUGH)
         steps = None
         if not (apart <= within).all():
             steps = steps_of_a_rough_function(function, points, scale, near)
@@ -248,39 +231,24 @@ def judged(
         tried = with_differences(function, points, scale, near)
         value = np.asarray(tried(points), dtype=float)
         try:
-            J = tried._by_complex_steps(points)
+            J = tried.complex_slopes(points)
         except Exception as error:
             return replace(tried, why=f"it takes no complex numbers ({type(error).__name__})")
         wrong = tried._wrong_slopes(points, value, J)
         if 2 * wrong.sum() > len(points):
             return replace(tried, why="complex steps find other slopes than differences")
-        rough = tried._roughness(points, value, J)[~wrong]
-        noise = 3 * float(np.where(np.isfinite(rough), rough, 0.0).max(initial=0.0))
+        # Where slopes are right, what they do not tell is the roughness of the function.
+        rough = _finite(tried.roughness(points, value, J)[~wrong])
+        noise = 3 * float(rough.max(initial=0.0))
         return replace(tried, noise=min(noise, _NOISIEST))
 
 
-def widest_steps(h: Rows, x: Array, rough: Array, near: Near = unmoved) -> Array:
-    """Finds the widest steps (n,) for differences at x (n,): parts of rough ones at which few
-    differences find the slopes in nearly all outputs."""
-    here = x[None]
+def same_values(a: Array, b: Array) -> bool:
+    """Tells whether values (rows, m) are the same to round-off of the largest of their row."""
     with np.errstate(all="ignore"):
-        wide = quick(h, here, rough, near)[0][0]
-        narrow = quick(h, here, _NARROWER * rough, near)[0][0] / _NARROWER
-        # Wide steps may step over what only narrow ones find.
-        if (np.abs(wide - narrow) <= 1e-3 * np.abs(narrow).max(axis=1, keepdims=True)).all():
-            return rough
-        slope, error = measured(h, here, along_units(rough, 1), near, _MANY_LEVELS).central
-        largest = np.abs(slope[0]).max(axis=1, keepdims=True)
-        allowed = np.maximum(3 * error[0], 1e-6 * np.maximum(np.abs(slope[0]), 1e-3 * largest))
-        best = _PARTS[-1] * rough
-        most = np.full(len(rough), 0.0)
-        for part in _PARTS:
-            found = quick(h, here, part * rough, near)[0][0] / part
-            share = (np.abs(found - slope[0]) <= allowed).mean(axis=0)
-            better = share > most + 0.01
-            best = np.where(better, part * rough, best)
-            most = np.where(better, share, most)
-    return best
+        alike = np.abs(a - b) <= _VALUES * _largest(b)
+        missing = np.isnan(a) & np.isnan(b)
+        return bool((alike | (a == b) | missing).all())
 
 
 def require_by_row(function: Rows, points: Array, what: str) -> None:
@@ -294,12 +262,21 @@ def require_by_row(function: Rows, points: Array, what: str) -> None:
                 f"{what}: gives other values each time it is called; take random numbers and"
                 " counters out of it: noise is drawn by the tool"
             )
-        alone: Any = [np.asarray(function(row[None]), dtype=float) for row in points]
-        size = np.abs(np.where(np.isfinite(together), together, 0.0)).max(axis=1, keepdims=True)
-        apart = np.abs(together - np.concatenate(alone))
-        both = ~np.isfinite(together) & ~np.isfinite(np.concatenate(alone))
-        if not (both | (apart <= _MIXED * size)).all():
+        alone = np.concatenate([np.asarray(function(row[None]), dtype=float) for row in points])
+        alike = np.abs(together - alone) <= _MIXED * _largest(together)
+        missing = ~np.isfinite(together) & ~np.isfinite(alone)
+        if not (alike | missing).all():
             raise UserError(
                 f"{what}: gives a row other values among others than alone; compute each row (the"
                 " last axis) by itself, such as by x - np.mean(x, axis=-1, keepdims=True)"
             )
+
+
+def _finite(values: Array) -> Array:
+    """Returns values with 0 in place of those that are not finite."""
+    return np.where(np.isfinite(values), values, 0.0)
+
+
+def _largest(values: Array) -> Array:
+    """Returns the largest magnitude (rows, 1) of the finite values of each row."""
+    return np.abs(_finite(values)).max(axis=1, keepdims=True)

@@ -68,13 +68,15 @@ def steps_of_a_rough_function(h: Rows, x: Array, scale: Array, near: Near) -> St
             """Selects of values (levels, rows, m, n) those of each number's level."""
             return values[levels, :, :, numbers].transpose(1, 2, 0)
 
-        right = at_their_levels(away) <= 3 * found.error + TOLERANCE * not_small(size, largest)
+        allowed = 3 * found.error + TOLERANCE * not_small(size, largest)
+        right = at_their_levels(away) <= allowed
         # A ladder that does not settle, as on a function that jumps everywhere, tells of no step.
         right &= found.error <= TELLING * largest
         right |= ~np.isfinite(found.slope)
         nearly = (right.mean(axis=1) >= _NEARLY_ALL).all(axis=1)
         known = np.isfinite(usual).all()
-        if not known or not nearly[0] or 2 * nearly.sum() <= len(x):
+        most = 2 * nearly.sum() > len(x)
+        if not (known and nearly[0] and most):
             return None
         apart = at_their_levels(apart)
         apart = np.median(np.where(np.isfinite(apart), apart, 0.0), axis=0)

@@ -16,12 +16,9 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, nearest
 from ipe_bench.basics.options import Component
-from ipe_bench.functions.judged import (
-    Judged,
-    by_complex_steps,
-    widest_steps,
-    with_differences,
-)
+from ipe_bench.functions.complex_steps import by_complex_steps
+from ipe_bench.functions.judged import Judged, with_differences
+from ipe_bench.functions.widest import widest_steps
 
 Epochs = tuple[NDArray[np.intp], ...]
 

@@ -22,7 +22,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply, own
 from ipe_bench.basics.options import Component, Count, Finite, Positive
 from ipe_bench.engine.scan import Step, dot
-from ipe_bench.functions.judged import by_complex_steps
+from ipe_bench.functions.complex_steps import by_complex_steps
 from ipe_bench.states.algebra import half, over, transposed, triangular
 from ipe_bench.states.layouts import Layout, full, named_step, packed, triangle
 from ipe_bench.states.steps import plus
