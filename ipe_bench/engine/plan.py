@@ -114,7 +114,8 @@ class StepPlan:
     def told(self) -> tuple[int, ...]:
         """Places of what is told of each reading's time beside the readings: the state, and where
         steps are watched the doubt."""
-        return tuple(self.y) if self.watch is None else (*self.y, *self.watch.doubt)
+        doubt = [] if self.watch is None else self.watch.doubt
+        return (*self.y, *doubt)
 
     @property
     def operations(self) -> int:
@@ -132,48 +133,18 @@ class StepPlan:
         return self.tableau.stages * counted + len(place) * weighed
 
 
-class _Frame:
-    """Gives out places, one vector after another."""
-
-    def __init__(self, equations: Equations) -> None:
-        self.size = 0
-        self.x = self.room(equations.parameters)
-        self.constants = self.room(equations.constants)
-        self.y = self.room(equations.states)
-        self.driven = self.constants[equations.constants - equations.driven :]
-
-    def room(self, count: int) -> range:
-        self.size += count
-        return range(self.size - count, self.size)
-
-
 def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> StepPlan:
     """Plans how readings or, if `sensitive`, their Jacobians are computed."""
     tape = Recording(equations)
     return _plan_jacobians(tape, tableau) if sensitive else _plan_readings(tape, tableau)
 
 
-Begun = list[tuple[Sequence[int], Sequence[Expression]]]
-"""Places, and what `begin` fills them with."""
-
-
-def _begin(tape: Recording, begun: Begun) -> tuple[Program, tuple[int, ...]]:
-    """Makes the program `begin`, and lists the places of its results."""
-    pairs = [pair for at, filling in begun for pair in zip(at, filling, strict=True)]
-    places = tuple(i for i, _ in pairs)
-    started = [e for _, e in pairs]
-    return Program.of(started, [*tape.p, *tape.c]), places
-
-
 def _plan_readings(tape: Recording, tableau: Tableau) -> StepPlan:
     """Plans the state alone, whose steps may be watched."""
     watched = tape.equations.watched
     sides = [watch.side_of_poles(tape)] if watched else []
-    fixed = tape.fixed(*tape.slope, *tape.shown, *sides)
-    frame = _Frame(tape.equations)
-    fixed_at = frame.room(len(fixed))
+    frame = _Frame(tape, tape.fixed(*tape.slope, *tape.shown, *sides))
     shown = frame.room(len(tape.shown))
-    begun: Begun = [(frame.y, tape.start), (fixed_at, fixed)]
     watch_plan = None
     if watched:
         watch_plan = WatchPlan(
@@ -183,25 +154,15 @@ def _plan_readings(tape: Recording, tableau: Tableau) -> StepPlan:
             side=frame.room(1),
             doubt=frame.room(1),
         )
-        begun.append((watch_plan.carried, watch.begun(tape, *sides)))
-    begin, places = _begin(tape, begun)
-    given = [*tape.moving, *fixed]
-    return StepPlan(
-        tableau=tableau,
-        x=frame.x,
-        constants=frame.constants,
-        y=frame.y,
-        driven=frame.driven,
-        fixed=fixed_at,
-        begin=begin,
-        begun=places,
-        rates=Program.of(tape.slope, given),
-        step=Program.of([*tape.slope, *sides], given),
-        read=Program.of(tape.shown, given),
+        frame.fill(watch_plan.carried, watch.begun(tape, *sides))
+    return frame.plan(
+        tableau,
+        rates=frame.program(tape.slope),
+        step=frame.program([*tape.slope, *sides]),
+        read=frame.program(tape.shown),
         read_at=shown,
         shown=shown,
-        size=frame.size,
-        watch=watch_plan,
+        watched=watch_plan,
     )
 
 
@@ -212,45 +173,100 @@ def _plan_jacobians(tape: Recording, tableau: Tableau) -> StepPlan:
     reading = _Linear(tape, along, along.shown)
     of_state = tape.fixed(*tape.slope, *motion.changing, *reading.changing)
     fixed = _distinct([*of_state, *motion.fixed, *reading.fixed])
-    frame = _Frame(tape.equations)
-    fixed_at = frame.room(len(fixed))
-    deviations = tuple(frame.room(len(along.d)) for _ in along.dp)
+    frame = _Frame(tape, fixed)
+    # A deviation begins with the start's own along each parameter.
+    deviations = []
+    for start in tape.along_each(along.dp, along.start):
+        deviations.append(frame.room(len(start)))
+        frame.fill(deviations[-1], start)
     # Stages lie one after another, each of the same size: `stage_size` leads from one to the next.
     stages = [frame.room(motion.size) for _ in range(tableau.stages)]
     kept_of_reading = frame.room(reading.size)
     shown = frame.room(len(along.shown))
-    begun: Begun = [(frame.y, tape.start), (fixed_at, fixed)]
-    # A deviation begins with the start's own along each parameter.
-    begun += zip(deviations, tape.along_each(along.dp, along.start), strict=True)
     # Sources that do not change along the solution are written once, behind those that do.
-    begun += [(motion.constant_at(stage), motion.constant_sources) for stage in stages]
-    begun.append((reading.constant_at(kept_of_reading), reading.constant_sources))
-    begin, places = _begin(tape, begun)
-    given = [*tape.moving, *fixed]
-    rates = Program.of([*tape.slope, *motion.changing], given)
-    return StepPlan(
-        tableau=tableau,
-        x=frame.x,
-        constants=frame.constants,
-        y=frame.y,
-        driven=frame.driven,
-        fixed=fixed_at,
-        begin=begin,
-        begun=places,
+    for stage in stages:
+        frame.fill(motion.constant_at(stage), motion.constant_sources)
+    frame.fill(reading.constant_at(kept_of_reading), reading.constant_sources)
+    rates = frame.program([*tape.slope, *motion.changing])
+    tangents = TangentPlan(
+        places=tuple(deviations),
+        motion=motion.placed(stages[0], fixed),
+        reading=reading.placed(kept_of_reading, fixed),
+        kept=tuple(motion.changing_at(stage) for stage in stages),
+        stage_size=motion.size,
+    )
+    return frame.plan(
+        tableau,
         rates=rates,
         step=rates,
-        read=Program.of(reading.changing, given),
+        read=frame.program(reading.changing),
         read_at=reading.changing_at(kept_of_reading),
         shown=shown,
-        size=frame.size,
-        tangents=TangentPlan(
-            places=deviations,
-            motion=motion.placed(stages[0], fixed),
-            reading=reading.placed(kept_of_reading, fixed),
-            kept=tuple(motion.changing_at(stage) for stage in stages),
-            stage_size=motion.size,
-        ),
+        tangents=tangents,
     )
+
+
+class _Frame:
+    """Gives out places, one vector after another, and notes what `begin` fills them with; what is
+    `fixed` is computed once a lane."""
+
+    def __init__(self, tape: Recording, fixed: Sequence[Expression]) -> None:
+        equations = tape.equations
+        self.size = 0
+        self.began = [*tape.p, *tape.c]
+        self.given = [*tape.moving, *fixed]
+        self.begun: list[tuple[int, Expression]] = []
+        self.x = self.room(equations.parameters)
+        self.constants = self.room(equations.constants)
+        self.y = self.room(equations.states)
+        self.fixed = self.room(len(fixed))
+        self.driven = self.constants[equations.constants - equations.driven :]
+        self.fill(self.y, tape.start)
+        self.fill(self.fixed, fixed)
+
+    def room(self, count: int) -> range:
+        self.size += count
+        return range(self.size - count, self.size)
+
+    def fill(self, places: Iterable[int], values: Iterable[Expression]) -> None:
+        """Lets `begin` fill places with values of the parameters and constants."""
+        self.begun += zip(places, values, strict=True)
+
+    def program(self, outputs: Sequence[Expression]) -> Program:
+        """Makes a program from (t, y, driven, fixed), which runs along the solution."""
+        return Program.of(outputs, self.given)
+
+    def plan(
+        self,
+        tableau: Tableau,
+        *,
+        rates: Program,
+        step: Program,
+        read: Program,
+        read_at: range,
+        shown: range,
+        tangents: TangentPlan | None = None,
+        watched: WatchPlan | None = None,
+    ) -> StepPlan:
+        """Makes the plan, once everything has its place."""
+        return StepPlan(
+            tableau=tableau,
+            x=self.x,
+            constants=self.constants,
+            y=self.y,
+            driven=self.driven,
+            fixed=self.fixed,
+            begin=Program.of([value for _, value in self.begun], self.began),
+            begun=tuple(place for place, _ in self.begun),
+            rates=rates,
+            step=step,
+            read=read,
+            read_at=read_at,
+            shown=shown,
+            size=self.size,
+            tangents=tangents,
+            watch=watched,
+        )
 
 
 class _Linear:

@@ -24,14 +24,16 @@ from ipe_bench.engine.emit.vectors import (
     F64,
     I64,
     PTR,
-    VOID,
     Value,
     Vectors,
     integer,
+    is_given,
     loop,
     number_at,
+    opened,
     put,
     room,
+    smaller,
 )
 from ipe_bench.engine.plan import LinearProgram, StepPlan, TangentPlan
 
@@ -54,28 +56,28 @@ class _Writer:
         self.module = ir.Module("integrate")
         weights = [weight for row in plan.tableau.weights for _, weight in row]
         self.count = -(-len(weights) // width)
-        padded = [*weights, *[0.0] * (self.count * width - len(weights))]
-        self.table = self._constant("weights", F64, padded, 8 * width)
+        missing = self.count * width - len(weights)
+        self.table = self._constant("weights", F64, weights + [0.0] * missing, 8 * width)
         self.begin = self._function("begin", [PTR], self._begin)
         self.weigh = self._function("weigh", [PTR, F64], self._weigh)
         self.step = self._function("step", [PTR, F64, F64], self._step)
         self.read = self._function("read", [PTR, F64], self._read)
         if plan.tangents is not None:
             self._write_tangents(plan.tangents)
-        kinds = [PTR, PTR, PTR, I64, PTR, I64, I64, PTR, PTR, I64, PTR, I64, PTR, PTR, PTR]
-        made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), "integrate")
-        _Loops(self, made).write()
+        _Loops(self).write()
 
     def _write_tangents(self, tangents: TangentPlan) -> None:
         kinds = [PTR, PTR, PTR]
         n = len(tangents.places)
         # Short tangents advance in pairs, and one alone where their number is odd.
-        paired = n - n % 2 if len(tangents.places[0]) < _FILLED else 0
+        short = len(tangents.places[0]) < _FILLED
+        paired = n - n % 2 if short else 0
         groups = (0, paired, 2), (paired, n, 1)
         self.groups = [group for group in groups if group[0] < group[1]]
         self.move = {}
         for *_, by in self.groups:
-            self.move[by] = self._function(f"move{by}", kinds, partial(self._move, tangents, by))
+            body = partial(self._move, tangents, by)
+            self.move[by] = self._function(f"move{by}", kinds, body)
         self.show = self._function("show", kinds, partial(self._show, tangents))
         moving = [i for row in tangents.motion.sources for i in row]
         self.sources = self._constant("sources", I64, moving or [0], 8)
@@ -83,7 +85,8 @@ class _Writer:
         self.show_sources = self._constant("show_sources", I64, shown or [0], 8)
 
     def _constant(self, name: str, kind: ir.Type, values: Sequence[Any], align: int) -> Value:
-        made: Any = ir.GlobalVariable(self.module, ir.ArrayType(kind, len(values)), name)
+        kinds = ir.ArrayType(kind, len(values))
+        made: Any = ir.GlobalVariable(self.module, kinds, name)
         made.global_constant = True
         made.linkage = "internal"
         made.align = align
@@ -96,11 +99,11 @@ class _Writer:
     ) -> ir.Function:
         """Writes a function of its own, never inlined, whose stack is aligned: registers that spill
         would else lie across cache lines, which takes half as long again."""
-        made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), name)
+        builder = opened(self.module, name, kinds)
+        made = builder.function
         made.linkage = "internal"
         made.attributes.add("noinline")
         made.attributes.alignstack = 64
-        builder = ir.IRBuilder(made.append_basic_block())
         body(Vectors(builder, self.width), *made.args)
         builder.ret_void()
         return made
@@ -116,55 +119,76 @@ class _Writer:
         share = v.spread(h)
         weights = v.load(self.table, range(self.count))
         weighed = [v.builder.fmul(share, weight) for weight in weights]
-        v.store(weighed, frame, range(self.plan.size, self.plan.size + self.count))
+        behind = self.plan.size
+        v.store(weighed, frame, range(behind, behind + self.count))
 
     def _weights(self, v: Vectors, frame: Value) -> list[list[Value]]:
+        """Loads the weights of every stage and of the end, each as a vector of equal numbers."""
         place = itertools.count(self.plan.size * self.width)
         weights = []
         for row in self.plan.tableau.weights:
             numbers = []
             for _ in row:
-                number = number_at(v.builder, frame, integer(next(place)))
+                number = number_at(v.builder, frame, next(place))
                 numbers.append(v.spread(number))
             weights.append(numbers)
         return weights
 
     def _step(self, v: Vectors, frame: Value, t: Value, h: Value) -> None:
+        """Writes one step of the state from t to t + h."""
         plan = self.plan
+        tableau = plan.tableau
         weights = self._weights(v, frame)
         y = v.load(frame, plan.y)
         fixed = v.load(frame, [*plan.driven, *plan.fixed])
         slopes: list[list[Value]] = []
         sides: list[Value] = []
         times: list[Value] = []
-        for s, row in enumerate(plan.tableau.weights[:-1]):
+        for s in range(tableau.stages):
             # Stage s: k_s = f(t + C_s h, y + h sum_j A_sj k_j).
-            at = v.combine(y, weights[s], [slopes[j] for j, _ in row])
-            time = v.call("fma", v.spread(h), v.constant(plan.tableau.C[s]), v.spread(t))
+            at = self._combined(v, y, weights[s], slopes, s)
+            length = v.spread(h)
+            time = v.call("fma", length, v.constant(plan.tableau.C[s]), v.spread(t))
             times.append(time)
             result = v.run(plan.step, [time, *at, *fixed])
             slopes.append(result[: len(plan.y)])
             if plan.watch is not None:
                 sides.append(result[-1])
             if plan.tangents is not None:
-                v.store(result[len(plan.y) :], frame, plan.tangents.kept[s])
+                kept = result[len(plan.y) :]
+                v.store(kept, frame, plan.tangents.kept[s])
         # The end of the step, y + h sum_s B_s k_s.
-        ended = v.combine(y, weights[-1], [slopes[j] for j, _ in plan.tableau.weights[-1]])
+        ended = self._combined(v, y, weights[-1], slopes, -1)
         v.store(ended, frame, plan.y)
-        if plan.watch is not None:
-            held = []
-            if plan.watch.timed:
-                # The rates of the stages' moments with the state held, where they depend on the
-                # time itself.
-                held = [v.run(plan.rates, [time, *y, *fixed]) for time in times]
-            moved = itertools.chain(*slopes, *held)
-            places = plan.watch.carried
-            given = [v.spread(h), *ended, *moved, *sides, *v.load(frame, places)]
-            v.store(v.run(plan.watch.program, given), frame, places)
+        if plan.watch is None:
+            return
+        moved = [*slopes]
+        if plan.watch.timed:
+            # The rates of the stages' moments with the state held, where they depend on the time
+            # itself.
+            moved += [v.run(plan.rates, [time, *y, *fixed]) for time in times]
+        places = plan.watch.carried
+        length = v.spread(h)
+        carried = v.load(frame, places)
+        given = [length, *ended, *itertools.chain(*moved), *sides, *carried]
+        v.store(v.run(plan.watch.program, given), frame, places)
+
+    def _combined(
+        self,
+        v: Vectors,
+        y: list[Value],
+        weights: list[Value],
+        slopes: list[list[Value]],
+        stage: int,
+    ) -> list[Value]:
+        """Computes y + h times the weighted slopes that a stage takes, or of -1 the end."""
+        row = self.plan.tableau.weights[stage]
+        return v.combine(y, weights, [slopes[j] for j, _ in row])
 
     def _read(self, v: Vectors, frame: Value, t: Value) -> None:
         plan = self.plan
-        given = [v.spread(t), *v.load(frame, [*plan.y, *plan.driven, *plan.fixed])]
+        places = [*plan.y, *plan.driven, *plan.fixed]
+        given = [v.spread(t), *v.load(frame, places)]
         v.store(v.run(plan.read, given), frame, plan.read_at)
 
     def _move(
@@ -176,60 +200,66 @@ class _Writer:
         first: Value,
         driving: Value,
     ) -> None:
-        """Writes one step of some tangents; `driving` points to the places of their sources."""
+        """Writes one step of some tangents that lie one behind another from `first` on; `driving`
+        points to the places of their sources."""
         plan = self.plan
-        move = tangents.motion
+        motion = tangents.motion
         weights = self._weights(v, frame)
-        one = range(together)
-        d = len(tangents.places[0])
-        count = len(move.sources[0])
-        own = [range(k * d, (k + 1) * d) for k in one]
-        y = [v.load(first, place) for place in own]
+        size = len(tangents.places[0])
+        count = len(motion.sources[0])
+        own = [range(k * size, (k + 1) * size) for k in range(together)]
+        d = [v.load(first, place) for place in own]
         fixed = v.load(frame, plan.fixed)
-        places = []
-        for k in one:
-            indices = range(k * count, (k + 1) * count)
-            places.append([number_at(v.builder, driving, integer(i), I64) for i in indices])
-        slopes: list[list[list[Value]]] = [[] for _ in one]
-        for s, row in enumerate(plan.tableau.weights[:-1]):
+        sources = [_places_at(v, driving, k * count, count) for k in range(together)]
+        slopes: list[list[list[Value]]] = [[] for _ in own]
+        for s in range(plan.tableau.stages):
             # The stages of the variational equations, by what the state's own stages have kept.
-            at = [v.combine(y[k], weights[s], [slopes[k][j] for j, _ in row]) for k in one]
+            at = [
+                self._combined(v, one, weights[s], slope, s)
+                for one, slope in zip(d, slopes, strict=True)
+            ]
             stage = v.place(frame, s * tangents.stage_size)
-            saved = v.load(stage, move.saved)
-            for k in one:
-                given = [*at[k], *v.load(stage, places[k]), *saved, *fixed]
-                slopes[k].append(v.run(move.program, given))
-        last = plan.tableau.weights[-1]
-        for k in one:
-            ended = v.combine(y[k], weights[-1], [slopes[k][j] for j, _ in last])
+            saved = v.load(stage, motion.saved)
+            for k in range(together):
+                source = v.load(stage, sources[k])
+                given = [*at[k], *source, *saved, *fixed]
+                slopes[k].append(v.run(motion.program, given))
+        for k in range(together):
+            ended = self._combined(v, d[k], weights[-1], slopes[k], -1)
             v.store(ended, first, own[k])
 
     def _show(
         self, tangents: TangentPlan, v: Vectors, frame: Value, first: Value, driving: Value
     ) -> None:
+        """Writes how readings move with one tangent."""
         plan = self.plan
-        show = tangents.reading
-        indices = range(len(show.sources[0]))
-        places = [number_at(v.builder, driving, integer(i), I64) for i in indices]
+        reading = tangents.reading
+        sources = _places_at(v, driving, 0, len(reading.sources[0]))
         moved = v.load(first, range(len(tangents.places[0])))
-        given = [*moved, *v.load(frame, [*places, *show.saved, *plan.fixed])]
-        v.store(v.run(show.program, given), frame, plan.shown)
+        others = v.load(frame, [*sources, *reading.saved, *plan.fixed])
+        v.store(v.run(reading.program, [*moved, *others]), frame, plan.shown)
+
+
+def _places_at(v: Vectors, table: Value, first: int, count: int) -> list[Value]:
+    """Loads places of a table, which are whole numbers."""
+    return [number_at(v.builder, table, i, I64) for i in range(first, first + count)]
 
 
 class _Loops:
     """Writes the loops over groups of lanes, readings and steps."""
 
-    def __init__(self, writer: _Writer, made: Any) -> None:
+    def __init__(self, writer: _Writer) -> None:
         self.writer = writer
         self.plan = writer.plan
         self.width = writer.width
-        problems = made.args[:7]
-        steps = made.args[7:10]
-        results = made.args[10:]
-        self.x, self.si, self.cases, self.n_cases, self.rows, self.first, self.last = problems
-        self.times, self.steps, self.n_times = steps
-        self.offset, self.stride, self.out, self.states, self.frame = results
-        self.b: Any = ir.IRBuilder(made.append_basic_block())
+        problems = [PTR, PTR, PTR, I64, PTR, I64, I64]
+        steps = [PTR, PTR, I64]
+        results = [PTR, I64, PTR, PTR, PTR]
+        self.b = opened(writer.module, "integrate", [*problems, *steps, *results])
+        self.x, self.si, self.cases, self.n_cases, *others = self.b.function.args
+        self.rows, self.first, self.last, *others = others
+        self.times, self.steps, self.n_times, *others = others
+        self.offset, self.stride, self.out, self.states, self.frame = others
         lanes = [room(self.b, I64, self.width) for _ in range(4)]
         self.target, self.shift, self.own, self.kept = lanes
         self.t = room(self.b, F64)
@@ -247,7 +277,7 @@ class _Loops:
             b.store(ir.Constant(F64, 0.0), self.t)
             # Unlike any step, so that the weights are always written.
             b.store(ir.Constant(F64, float("nan")), self.taken)
-            with loop(b, integer(0), self.n_times) as k:
+            with loop(b, 0, self.n_times) as k:
                 to = number_at(b, self.times, k)
                 self._advance(k, to)
                 self._keep(b.add(k, integer(1)))
@@ -258,7 +288,7 @@ class _Loops:
         b.ret_void()
 
     def _lanes(self) -> Any:
-        return loop(self.b, integer(0), integer(self.width))
+        return loop(self.b, 0, self.width)
 
     def _at(self, place: int, lane: Value) -> Value:
         """Returns the pointer to one number in a vector of the frame."""
@@ -270,7 +300,8 @@ class _Loops:
         """Returns pointers to tangent j and to the list of its sources."""
         b = self.b
         first = tangents.places[0]
-        lies = b.add(integer(first.start), b.mul(j, integer(len(first))))
+        behind = b.mul(j, integer(len(first)))
+        lies = b.add(integer(first.start), behind)
         place = Vectors(b, self.width).place(self.frame, lies)
         sources = b.mul(j, integer(len(linear.sources[0])))
         return [place, b.gep(table, [sources], source_etype=I64)]
@@ -283,7 +314,7 @@ class _Loops:
         # Lane l is trial rows[l / n_cases] in case l % n_cases; beyond the last, the last again.
         here = b.add(group, lane)
         end = b.sub(self.last, integer(1))
-        problem = b.select(b.icmp_signed("<", here, end), here, end)
+        problem = smaller(b, here, end)
         trial = number_at(b, self.rows, b.udiv(problem, self.n_cases), I64)
         case = b.urem(problem, self.n_cases)
         row = b.mul(trial, n)
@@ -297,22 +328,23 @@ class _Loops:
             put(b, number, self.frame, self._at(place, lane))
         # Where the lane's readings go, what is subtracted of them, its constants, and its states.
         place = b.add(b.mul(trial, self.n_cases), case)
+        times = b.mul(place, self.n_times)
         size = integer(len(plan.shown) * self.columns)
-        put(b, b.mul(b.mul(place, self.n_times), size), self.target, lane)
+        put(b, b.mul(times, size), self.target, lane)
         put(b, b.mul(case, self.stride), self.shift, lane)
         put(b, constants, self.own, lane)
-        moments = b.add(self.n_times, integer(1))
+        moments = b.mul(place, b.add(self.n_times, integer(1)))
         size = integer(len(plan.told))
-        put(b, b.mul(b.mul(place, moments), size), self.kept, lane)
+        put(b, b.mul(moments, size), self.kept, lane)
 
     def _keep(self, k: Value) -> None:
         """Writes the state at the time k, the start being 0, if it is asked for."""
         b = self.b
-        asked = b.icmp_signed("!=", b.ptrtoint(self.states, I64), integer(0))
-        with b.if_then(asked), self._lanes() as lane:
+        with b.if_then(is_given(b, self.states)), self._lanes() as lane:
             row = b.add(number_at(b, self.kept, lane, I64), k)
             for place in self.plan.told:
-                put(b, number_at(b, self.frame, self._at(place, lane)), self.states, row)
+                number = number_at(b, self.frame, self._at(place, lane))
+                put(b, number, self.states, row)
                 row = b.add(row, b.add(self.n_times, integer(1)))
 
     def _advance(self, k: Value, to: Value) -> None:
@@ -323,19 +355,21 @@ class _Loops:
         since = b.load(self.t, typ=F64)
         # No step to a time that is reached already: at the start, or where two readings share one.
         there = b.fcmp_ordered("==", to, since)
-        count = b.select(there, integer(0), number_at(b, self.steps, k, I64))
+        wanted = number_at(b, self.steps, k, I64)
+        count = b.select(there, integer(0), wanted)
         h = b.fdiv(b.fsub(to, since), b.sitofp(count, F64))
         # The weights times h are written again where the step has changed.
-        with b.if_then(b.fcmp_unordered("!=", h, b.load(self.taken, typ=F64))):
+        changed = b.fcmp_unordered("!=", h, b.load(self.taken, typ=F64))
+        with b.if_then(changed):
             b.call(writer.weigh, [self.frame, h])
         b.store(h, self.taken)
         # One step of the state, then of the tangents beside it.
-        with loop(b, integer(0), count) as s:
+        with loop(b, 0, count) as s:
             time = b.fadd(since, b.fmul(b.sitofp(s, F64), h))
             b.call(writer.step, [self.frame, time, h])
             if tangents is not None:
                 for begin, end, by in writer.groups:
-                    with loop(b, integer(begin), integer(end), by) as j:
+                    with loop(b, begin, end, by) as j:
                         moved = self._tangent(j, writer.sources, tangents, tangents.motion)
                         b.call(writer.move[by], [self.frame, *moved])
         b.store(to, self.t)
@@ -345,7 +379,8 @@ class _Loops:
         b = self.b
         plan = self.plan
         size = integer(len(plan.constants))
-        later = b.mul(b.add(k, integer(1)), b.mul(self.n_cases, size))
+        interval = b.add(k, integer(1))
+        later = b.mul(interval, b.mul(self.n_cases, size))
         first = len(plan.constants) - len(plan.driven)
         with self._lanes() as lane:
             row = b.add(later, number_at(b, self.own, lane, I64))
@@ -361,7 +396,7 @@ class _Loops:
         tangents = plan.tangents
         columns = integer(self.columns)
         done = b.mul(k, integer(len(plan.shown)))
-        with loop(b, integer(0), columns) as j:
+        with loop(b, 0, columns) as j:
             if tangents is not None:
                 shown = self._tangent(j, self.writer.show_sources, tangents, tangents.reading)
                 b.call(self.writer.show, [self.frame, *shown])
@@ -375,5 +410,5 @@ class _Loops:
                     else:
                         offset = number_at(b, self.offset, b.add(less, integer(i)))
                         value = b.fsub(value, offset)
-                    entry = b.add(b.mul(b.add(done, integer(i)), columns), j)
-                    put(b, value, self.out, b.add(begin, entry))
+                    row = b.mul(b.add(done, integer(i)), columns)
+                    put(b, value, self.out, b.add(begin, b.add(row, j)))
