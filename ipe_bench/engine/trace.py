@@ -14,7 +14,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -88,14 +88,18 @@ class Graph:
         self, name: str, sizes: Iterable[Any], operands: Sequence[Any], count: int
     ) -> list[Expression]:
         """Applies an operation of many operands and `count` results, which is written as loops."""
-        args = [a if isinstance(a, Expression) else self.constant(a) for a in operands]
-        made = self._node(" ".join(map(str, [name, *sizes])), *args)
+        operation = " ".join(map(str, [name, *sizes]))
+        made = self._node(operation, *self._expressions(operands))
         return [self._node(f"part {i}", made) for i in range(count)]
+
+    def _expressions(self, operands: Iterable[Any]) -> list[Expression]:
+        """Returns operands with constants in place of numbers."""
+        return [a if isinstance(a, Expression) else self.constant(a) for a in operands]
 
     def apply(self, operation: str, *operands: Any) -> Expression:
         """Applies an operation to operands, with constants folded and trivial operations
         dropped."""
-        args = [a if isinstance(a, Expression) else self.constant(a) for a in operands]
+        args = self._expressions(operands)
         values = [a.value for a in args]
         # An operation on constants is a constant.
         if all(v is not None for v in values):
@@ -266,7 +270,8 @@ def _tie(apply: Callable[..., Any], a: Any, b: Any) -> Any:
 
 def _first_if(apply: Callable[..., Any], condition: Any, a: Any, b: Any) -> Any:
     """Returns a where the condition holds or a is not a number, else b."""
-    return apply("where", condition, a, apply("where", apply("less_equal", a, a), b, a))
+    other = apply("where", apply("less_equal", a, a), b, a)
+    return apply("where", condition, a, other)
 
 
 _OPERATORS: dict[str, Callable[..., Any]] = {
@@ -377,8 +382,8 @@ def border(outputs: Sequence[Expression], varying: Collection[Expression]) -> li
     number."""
     # The operands of varying operations, and outputs, that do not vary themselves.
     used = [a for e in in_order(outputs) if e in varying for a in operands(e)]
-    distinct = {e.order: e for e in [*used, *outputs] if e not in varying and e.value is None}
-    return [distinct[order] for order in sorted(distinct)]
+    outside = {e for e in [*used, *outputs] if e not in varying and e.value is None}
+    return sorted(outside, key=lambda e: e.order)
 
 
 def substitute(
@@ -386,9 +391,14 @@ def substitute(
 ) -> list[Expression]:
     """Replaces some inputs or numbers of expressions, and simplifies these."""
     known: dict[Expression, Expression] = {}
-    for a in in_order(outputs):
-        given = [known[o] for o in operands(a)]
-        known[a] = values[a] if a in values else a.graph.apply(a.operation, *given) if given else a
+    for e in in_order(outputs):
+        given = [known[a] for a in operands(e)]
+        if e in values:
+            known[e] = values[e]
+        elif given:
+            known[e] = e.graph.apply(e.operation, *given)
+        else:
+            known[e] = e
     return [known[e] for e in outputs]
 
 
@@ -400,7 +410,11 @@ def slopes(output: Expression, inputs: Iterable[Expression]) -> list[Expression]
         for a in operands(e):
             users[a].append(e)
     one = output.graph.constant(1.0)
-    return [tangent([output], {a: one}, in_order([a], needs=users.__getitem__))[0] for a in inputs]
+    found = []
+    for a in inputs:
+        affected = in_order([a], needs=users.__getitem__)
+        found += tangent([output], {a: one}, affected)
+    return found
 
 
 def tangent(
@@ -414,26 +428,28 @@ def tangent(
         return []
     # Forward mode: along[e] is the tangent of e (Griewank and Walther, Evaluating Derivatives,
     # 2008, section 3.1).
-    zero = outputs[0].graph.constant(0.0)
+    graph = outputs[0].graph
+    zero = graph.constant(0.0)
     along: defaultdict[int, Expression] = defaultdict(lambda: zero)
     for e in in_order(outputs) if varying is None else varying:
         if e.operation in ("input", "constant"):
             along[e.order] = direction.get(e, zero)
             continue
-        along[e.order] = zero
-        moving = [
-            (along[a.order], i) for i, a in enumerate(e.operands) if along[a.order] is not zero
-        ]
-        if not moving or e.operation in FLAT:
-            continue
-        if e.operation == "where":  # a branch that is not taken may have no slope
-            condition, *branches = operands(e)
-            along[e.order] = e.graph.apply("where", condition, *(along[a.order] for a in branches))
-            continue
-        # The chain rule: de = sum_i (de / da_i) da_i over the operands that move.
-        partials = _PARTIALS[e.operation](e, e.graph.constant(1.0), e.operands[0], e.operands[-1])
-        for da, i in moving:
-            along[e.order] = along[e.order] + partials[i] * da
+        moves = [along[a.order] for a in e.operands]
+        if e.operation in FLAT or all(da is zero for da in moves):
+            along[e.order] = zero
+        elif e.operation == "where":
+            # Not by the chain rule: a branch that is not taken may have no slope.
+            along[e.order] = graph.apply("where", e.operands[0], *moves[1:])
+        else:
+            # The chain rule: de = sum_i (de / da_i) da_i over the operands that move.
+            one = graph.constant(1.0)
+            partials = _PARTIALS[e.operation](e, one, e.operands[0], e.operands[-1])
+            total = zero
+            for partial, da in zip(partials, moves, strict=True):
+                if da is not zero:
+                    total = total + partial * da
+            along[e.order] = total
     return [along[e.order] for e in outputs]
 
 
@@ -465,7 +481,8 @@ def separate(
         own = [parts.get(a.order, _NOTHING) for a in operands(e)]
         if e.order not in parts and any(part != _NOTHING for part in own):
             parts[e.order] = _linear(e, own, joined)
-    return [joined(parts[e.order]) if e.order in parts else e for e in tangents], list(sources)
+    separated = [joined(parts[e.order]) if e.order in parts else e for e in tangents]
+    return separated, list(sources)
 
 
 _Parts: TypeAlias = "tuple[Expression | None, Expression | None]"
@@ -474,30 +491,40 @@ _NOTHING: _Parts = (None, None)
 
 def _linear(e: Expression, own: Sequence[_Parts], joined: Callable[[_Parts], Expression]) -> _Parts:
     """Returns the parts of an operation that is linear in the parts of its operands."""
-    apply, given = e.graph.apply, operands(e)
-    if e.operation in ("neg", "add", "sub", "where"):
-        held, terms = (given[:1], own[1:]) if e.operation == "where" else ([], own)
-
-        def applied(*values: Expression | None) -> Expression | None:
-            given = [0.0 if v is None else v for v in values]
-            return apply(e.operation, *held, *given) if any(v is not None for v in values) else None
-
-        moved, source = (applied(*values) for values in zip(*terms, strict=True))
-        return moved, source
+    if e.operation in ("neg", "add", "sub"):
+        return _each_part(e, [], own)
+    if e.operation == "where":
+        return _each_part(e, operands(e)[:1], own[1:])
     # A product or quotient is linear if one operand alone has parts, and divides by none.
-    (place, part), *others = [(i, part) for i, part in enumerate(own) if part != _NOTHING]
-    if e.operation not in ("mul", "div") or (e.operation == "div" and place == 1) or others:
+    moving = [i for i, part in enumerate(own) if part != _NOTHING]
+    place = moving[0]
+    divides = e.operation == "div" and place == 1
+    if e.operation not in ("mul", "div") or divides or len(moving) > 1:
         raise TypeError(f"a tangent is not linear: {e.operation}")
 
     def scaled(value: Expression) -> Expression:
-        return apply(e.operation, *(value if i == place else a for i, a in enumerate(given)))
+        given = operands(e)
+        given[place] = value
+        return e.graph.apply(e.operation, *given)
 
-    moved, source = part
-    return (
-        (None, scaled(source))
-        if moved is None and source is not None
-        else (scaled(joined(part)), None)
-    )
+    moved, source = own[place]
+    if moved is None and source is not None:
+        return None, scaled(source)
+    return scaled(joined(own[place])), None
+
+
+def _each_part(e: Expression, held: Sequence[Expression], terms: Sequence[_Parts]) -> _Parts:
+    """Applies a sum, or a choice by what is `held`, to either part of its terms."""
+
+    def applied(values: Sequence[Expression | None]) -> Expression | None:
+        if all(value is None for value in values):
+            return None
+        given = [0.0 if value is None else value for value in values]
+        return e.graph.apply(e.operation, *held, *given)
+
+    moved = applied([moved for moved, _ in terms])
+    source = applied([source for _, source in terms])
+    return moved, source
 
 
 @dataclass(frozen=True)
@@ -522,9 +549,10 @@ class Program:
         given = set(inputs)
         needed = [e for e in in_order(outputs, inputs) if e not in given]
         # A product that is used once, in a sum, is computed in the sum (fused multiply-add).
-        uses = Counter(used.order for used in [*(a for e in needed for a in operands(e)), *outputs])
-        fused = {e.order: found for e in needed if (found := _fusion(e, uses, given))}
-        inside = {product.order for _, product, _ in fused.values()}
+        used = [a for e in needed for a in operands(e)]
+        uses = Counter(e.order for e in [*used, *outputs])
+        fusions = {e.order: _fusion(e, uses, given) for e in needed}
+        inside = {found.product.order for found in fusions.values() if found}
         # The values are numbered: the inputs first, then the results of the operations.
         number = {e.order: i for i, e in enumerate(inputs)}
         operations: list[tuple[Any, ...]] = []
@@ -533,23 +561,29 @@ class Program:
                 continue
             if e.operation == "input":
                 raise ValueError(f"the program has no input {e.operands[0]}")
+            found = fusions[e.order]
             if e.operation == "constant":
-                operations.append(("constant", e.value))
+                operation = ("constant", e.value)
+            elif found:
+                taken = [*operands(found.product), found.other]
+                operation = (found.name, *(number[a.order] for a in taken))
             else:
-                name, product, other = fused.get(e.order, (e.operation, e, None))
-                taken = [*operands(product), *([] if other is None else [other])]
-                operations.append((name, *(number[a.order] for a in taken)))
-            number[e.order] = len(inputs) + len(operations) - 1
-        return cls(len(inputs), tuple(operations), tuple(number[e.order] for e in outputs))
+                operation = (e.operation, *(number[a.order] for a in operands(e)))
+            number[e.order] = len(inputs) + len(operations)
+            operations.append(operation)
+        results = tuple(number[e.order] for e in outputs)
+        return cls(len(inputs), tuple(operations), results)
 
     @cached_property
     def _released(self) -> tuple[tuple[int, ...], ...]:
         """The values that nothing needs after each operation."""
         # From the last operation back: what none after it needs is released there.
-        needed, released = set(self.outputs), []
+        needed = set(self.outputs)
+        released = []
         for name, *numbers in reversed(self.operations):
-            released.append(() if name == "constant" else tuple(set(numbers) - needed))
-            needed.update(released[-1])
+            last_used = set() if name == "constant" else set(numbers) - needed
+            needed |= last_used
+            released.append(tuple(last_used))
         return tuple(reversed(released))
 
     def __call__(self, inputs: Sequence[Any]) -> list[Any]:
@@ -557,12 +591,10 @@ class Program:
         arrays."""
         values = list(inputs)
         for (name, *numbers), released in zip(self.operations, self._released, strict=True):
-            result = (
-                np.float64(numbers[0])
-                if name == "constant"
-                else _ARRAYS[name](*[values[i] for i in numbers])
-            )
-            values.append(result)
+            if name == "constant":
+                values.append(np.float64(numbers[0]))
+            else:
+                values.append(_ARRAYS[name](*[values[i] for i in numbers]))
             for i in released:
                 values[i] = None
         return [values[i] for i in self.outputs]
@@ -590,18 +622,30 @@ class RowPrograms:
         moved = tangent(y, dict(zip(x, along, strict=True)))
         saved = border(moved, dependent(moved, along))
         values = Program.of([*y, *saved], [*x, *c])
-        return cls(len(x), len(y), values, Program.of(moved, [*along, *saved]))
+        tangents = Program.of(moved, [*along, *saved])
+        return cls(len(x), len(y), values, tangents)
+
+
+class _Fused(NamedTuple):
+    """Holds the fused operation that a sum is: its name, the product in it, and the other
+    operand."""
+
+    name: str
+    product: Expression
+    other: Expression
 
 
 def _fusion(
     e: Expression, uses: Mapping[int, int], inputs: Collection[Expression]
-) -> tuple[str, Expression, Expression] | None:
-    """Returns the name of the fused operation that an expression can be, the product in it, and the
-    other operand."""
-    if e.operation in ("add", "sub"):
-        # a b + c, a b - c, or c - a b.
-        a, b = operands(e)
-        for product, other, subtracted in ((a, b, "fms"), (b, a, "fnma")):
-            if product.operation == "mul" and uses[product.order] == 1 and product not in inputs:
-                return "fma" if e.operation == "add" else subtracted, product, other
+) -> _Fused | None:
+    """Returns the fused operation that an expression can be, a b + c, a b - c or c - a b, or
+    None."""
+    if e.operation not in ("add", "sub"):
+        return None
+    a, b = operands(e)
+    for product, other, subtracted in ((a, b, "fms"), (b, a, "fnma")):
+        once = uses[product.order] == 1
+        if product.operation == "mul" and once and product not in inputs:
+            name = "fma" if e.operation == "add" else subtracted
+            return _Fused(name, product, other)
     return None
