@@ -87,21 +87,28 @@ TIME_WEIGHTS = (
     0.0,
     0.0,
 )
-_REACH, STABLE = 6.0, 5.0
-"""About where the stability region of DOP853 ends on the negative real axis, and a step over the
-fastest rate to which it is stable."""
+STABLE = 5.0
+"""A step of DOP853 times the fastest rate up to which it is stable."""
+_REACH = 6.0
+"""About where the stability region of DOP853 ends on the negative real axis."""
 MOST_STEPS = 4000
 SHAPE = 1e-4
 """A relative tolerance that shows the shape of a solution."""
 _SMALLEST = 1e-9
 """Absolute tolerance over the relative one, in units of the states."""
-_SAFETY, _SHRINK, _GROW = 0.9, 0.2, 6.0
+_SAFETY = 0.9
+"""Part of the step that the error allows which is taken next."""
+_SHRINK = 0.2
+"""Part of a step below which the next is never tried; `_GROW`, above which."""
+_GROW = 6.0
 _THROUGH = 1e-5
 """Share of the usual interval below which a step may change the sign of what the rates divide by:
 longer ones would jump over a pole."""
-_LOOKS, _UNSEEN = 1024, 0.01
+_LOOKS = 1024
 """Moments within the usual interval at which rates that depend on t are looked at, lest a step
-misses a pulse; and the share of a state by which a step may miss what is seen there."""
+misses a pulse."""
+_UNSEEN = 0.01
+"""Share of a state by which a step may miss what is seen there."""
 
 
 @dataclass(frozen=True)
@@ -207,14 +214,15 @@ class Rodas5P:
         """Computes the same readings, and how far each is moved by states that move by their
         largest magnitudes."""
         run = _Run(self, x, stop, reaching=True)
-        return run.readings, run.reach.transpose(2, 1, 0).reshape(len(x), -1)
+        return run.readings, run.by_trial(run.reach)
 
     def jacobian(self, x: Array, stop: int) -> Array:
         """Computes their derivatives by x (trials, cases x stop x outputs, n)."""
         cases = self.of.tables.shape[1]
         readings = cases * stop * self.of.equations.outputs
-        J = _Run(self, x, stop, sensitive=True).J.transpose(3, 1, 0, 2)
-        return J.reshape(len(x), readings, -1) * self.of.sizes
+        J = _Run(self, x, stop, sensitive=True).J
+        by_trial = J.transpose(3, 1, 0, 2).reshape(len(x), readings, -1)
+        return by_trial * self.of.sizes
 
 
 class _Run:
@@ -248,7 +256,8 @@ class _Run:
         self.tables = method.of.tables
         cases = self.tables.shape[1]
         self.case = np.tile(np.arange(cases), len(x))
-        self.p = np.repeat(x * method.of.sizes, cases, axis=0).T.copy()
+        parameters = x * method.of.sizes
+        self.p = np.repeat(parameters, cases, axis=0).T.copy()
         # A Jacobian has a direction for each parameter, readings alone have none.
         self.directions = np.eye(equations.parameters)[:, :, None]
         self.q = equations.parameters if sensitive else 0
@@ -266,7 +275,13 @@ class _Run:
         with np.errstate(all="ignore"):
             self._start(equations.states, lanes)
             self._integrate()
-        self.readings = self.z.transpose(2, 1, 0).reshape(len(x), -1)
+        self.trials = len(x)
+        self.readings = self.by_trial(self.z)
+
+    def by_trial(self, found: Array) -> Array:
+        """Turns numbers of readings (outputs, times, lanes) into rows (trials, cases x times x
+        outputs)."""
+        return found.transpose(2, 1, 0).reshape(self.trials, -1)
 
     def _start(self, states: int, lanes: int) -> None:
         """Sets the states y (states, lanes) and their sensitivities S at t = 0."""
@@ -275,7 +290,8 @@ class _Run:
         self.largest = np.abs(self.y)
         self.S = np.zeros((states, 0, lanes))
         if self.q:
-            self.S = self._values("dstart", [*began, *self.directions], self.q, lanes)
+            along = [*began, *self.directions]
+            self.S = self._values("dstart", along, self.q, lanes)
 
     def _values(self, name: str, inputs: Sequence[Any], *shape: int) -> Array:
         """Returns the outputs of a program, of which some may be numbers, as one array."""
@@ -307,10 +323,12 @@ class _Run:
             # A step that ends on a reading ends on its very time, whatever round-off adds.
             arrives = now[good] == left[good]
             there = self.times[self.place[done]]
-            self.t[done] = np.where(arrives, there, self.t[done] + now[good])
+            on_the_way = self.t[done] + now[good]
+            self.t[done] = np.where(arrives, there, on_the_way)
             self.y[:, done] = y[:, good]
             self.S[:, :, done] = S[:, :, good]
-            self.largest[:, done] = np.fmax(self.largest[:, done], np.abs(y[:, good]))
+            size = np.abs(self.y[:, done])
+            self.largest[:, done] = np.fmax(self.largest[:, done], size)
 
     def _going(self, lanes: Array) -> Array:
         """Tells the lanes that have readings to come and steps left."""
@@ -322,7 +340,8 @@ class _Run:
         a lane."""
         # h <- h 0.9 error^(-1/5), within 0.2 to 6 times h: the embedded solution has order 4
         # (Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, eq. II.4.13).
-        change = np.clip(_SAFETY * np.maximum(error, 1e-10) ** -0.2, _SHRINK, _GROW)
+        change = _SAFETY * np.maximum(error, 1e-10) ** -0.2
+        change = np.clip(change, _SHRINK, _GROW)
         wanted = now * np.where(np.isfinite(error), change, _SHRINK)
         # What a reading cut short says nothing against the step that was wanted.
         cut = (error <= 1) & (now < h)
@@ -335,7 +354,8 @@ class _Run:
         """Takes the readings whose time has come, at t = 0 too, in these lanes."""
         while True:
             here = here[self.place[here] < len(self.times)]
-            here = here[self.t[here] == self.times[self.place[here]]]
+            come = self.t[here] == self.times[self.place[here]]
+            here = here[come]
             if not len(here):
                 return
             at = self._point(here, later=1)
@@ -345,8 +365,8 @@ class _Run:
                 self.reach[:, now, here] = self._reached(here, at)
             if self.q:
                 # dh/dx = dh/dy dy/dx + dh/dp, dy/dx being S.
-                ways = [*self.S[:, :, here], *self.directions]
-                slopes = self._values("dread", [*at, *ways], self.q, len(here))
+                along = [*at, *self.S[:, :, here], *self.directions]
+                slopes = self._values("dread", along, self.q, len(here))
                 self.J[:, now, :, here] = slopes.transpose(2, 0, 1)
             self.place[here] += 1
 
@@ -354,15 +374,20 @@ class _Run:
         """Computes by how much readings move with states that move by their largest magnitudes:
         sum_i |dh/dy_i| max|y_i|."""
         n = len(self.y)
-        sizes = self.largest[:, here] * np.eye(n)[:, :, None]
-        still = np.zeros(self.p.shape[0])
+        # A direction for each state: that one moves by its size, all others and p stay.
+        each = np.eye(n)[:, :, None]
+        sizes = self.largest[:, here] * each
+        still = np.zeros(len(self.p))
         moved = self._values("dread", [*at, *sizes, *still], n, len(here))
         return np.abs(moved).sum(axis=1)
 
     def _point(self, lanes: Array, later: int = 0) -> list[Any]:
         """Returns t, y, p and c of each lane, as programs take them."""
-        c = self._constants(lanes, later)
-        return [self.t[lanes], *self.y[:, lanes], *self.p[:, lanes], *c]
+        return [self.t[lanes], *self.y[:, lanes], *self._held(lanes, later)]
+
+    def _held(self, lanes: Array, later: int = 0) -> list[Any]:
+        """Returns p and c of each lane, which a step leaves as they are."""
+        return [*self.p[:, lanes], *self._constants(lanes, later)]
 
     def _constants(self, lanes: Array, later: int = 0) -> Array:
         """Returns the constants of the interval to the next time of each lane, or those that hold
@@ -386,17 +411,19 @@ class _Run:
         exchanged = _factor(W)
         K, D = self._stages(live, h, W, exchanged)
         # Stiffly accurate: the last stage starts from the embedded solution, and is its error.
-        y1 = y + _weighted(A[-1], K[:-1]) + K[-1]
+        y1 = _ended(y, K)
         S1 = self.S[:, :, live]
         if self.q:
-            S1 = S1 + _weighted(A[-1], D[:-1]) + D[-1]
+            S1 = _ended(S1, D)
         largest = np.maximum(np.abs(y), np.abs(y1))
         # The norm is the largest error of a state in units of its tolerance.
-        error = (np.abs(K[-1]) / (self.atol + self.rtol * largest)).max(axis=0)
+        tolerance = self.atol + self.rtol * largest
+        error = (np.abs(K[-1]) / tolerance).max(axis=0)
         if self.timed:
             # A pulse between the stages shows in the mean rate over the step.
-            unseen = _solve(W, exchanged, self._unseen(live, h)[:, None])[:, 0]
-            missed = (np.abs(unseen) / (self.atol + _UNSEEN * largest)).max(axis=0)
+            unseen = _solved(W, exchanged, self._unseen(live, h))
+            tolerance = self.atol + _UNSEEN * largest
+            missed = (np.abs(unseen) / tolerance).max(axis=0)
             error = np.where(missed > 1.0, np.fmax(missed, error), error)
         if self.divided:
             # Beyond a pole the solution is another one: the step is refused until it is very short.
@@ -416,27 +443,32 @@ class _Run:
         """
         q = self.q
         lanes = len(live)
-        t, y, p, c = self.t[live], self.y[:, live], self.p[:, live], self._constants(live)
+        t = self.t[live]
+        y = self.y[:, live]
         S = self.S[:, :, live]
-        at = (t, *y, *p, *c)
-        ways = (*S, *self.directions)
+        held = self._held(live)
+        at = [t, *y, *held]
+        ways = [*S, *self.directions]
         ft = self._values("ft", at, lanes)
-        dft = self._values("dft", [*at, *ways], q, lanes) if q else ft
+        dft = ft
+        if q:
+            dft = self._values("dft", at + ways, q, lanes)
         K = list[Array]()
         D = list[Array]()
         for a, b, node, weight in zip(A, C, NODES, TIME_WEIGHTS, strict=True):
             u = y + _weighted(a, K)
-            inside = (t + node * h, *u, *p, *c)
+            inside = [t + node * h, *u, *held]
             rest = self._values("f", inside, lanes) + h * weight * ft
             rest = rest + _weighted(b, K) / h
-            K.append(_solve(W, exchanged, rest[:, None])[:, 0])
+            K.append(_solved(W, exchanged, rest))
             if q:
                 # The same stage differentiated; dW = -dJ adds (dJ) u_i to the right side.
                 V = S + _weighted(a, D)
                 moved = self._values("df", [*inside, *V, *self.directions], q, lanes)
+                turned = self._values("dJk", [*at, *K[-1], *ways], q, lanes)
                 rest = moved + h * weight * dft
                 rest = rest + _weighted(b, D) / h
-                rest = rest + self._values("dJk", [*at, *K[-1], *ways], q, lanes)
+                rest = rest + turned
                 D.append(_solve(W, exchanged, rest))
         return K, D
 
@@ -453,7 +485,7 @@ class _Run:
 
     def _crossed(self, live: Array, at: Sequence[Any], h: Array, y1: Array) -> Array:
         """Tells the lanes in which something that the rates divide by changes its sign."""
-        after = [self.t[live] + h, *y1, *self.p[:, live], *self._constants(live)]
+        after = [self.t[live] + h, *y1, *self._held(live)]
         before_sides = self._values("side", at, len(live))[0]
         return before_sides != self._values("side", after, len(live))[0]
 
@@ -463,7 +495,8 @@ class _Run:
         found = np.zeros((len(self.y), len(live)))
         # As many looks as fall into the step, in powers of two so that few sizes occur.
         wanted = np.maximum(_LOOKS * h / self.interval, 1.0)
-        powers = np.minimum(np.ceil(np.log2(wanted)), np.log2(_LOOKS)).astype(int)
+        powers = np.ceil(np.log2(wanted))
+        powers = np.minimum(powers, np.log2(_LOOKS)).astype(int)
         for power in sorted(set(powers[powers > 0].tolist())):
             here = powers == power
             lanes = live[here]
@@ -474,7 +507,8 @@ class _Run:
             at = (self.t[lanes] + shares * h[here], *rest)
             f = self._values("f", at, len(shares), len(lanes))
             # The midpoint rule of all looks, less Simpson's rule of the ends and the middle.
-            by_simpson = (f[:, 0] + 4.0 * f[:, 1] + f[:, 2]) / 6.0
+            begin, middle, end = f[:, :3].swapaxes(0, 1)
+            by_simpson = (begin + 4.0 * middle + end) / 6.0
             found[:, here] = f[:, 3:].mean(axis=1) - by_simpson
         return found
 
@@ -487,7 +521,8 @@ class _Run:
         speed = (np.abs(f) / scale).max(axis=0)
         size = (np.abs(self.y) / scale).max(axis=0)
         moves = (speed > 1e-5) & (size > 1e-5)
-        return np.where(moves, np.minimum(1e-3 * size / speed, self.end), 1e-6 * self.end)
+        wanted = np.minimum(1e-3 * size / speed, self.end)
+        return np.where(moves, wanted, 1e-6 * self.end)
 
 
 def _usual(times: Array) -> float:
@@ -508,6 +543,13 @@ def _to_the_reading(h: Array, left: Array) -> Array:
 
 def _weighted(weights: Sequence[float], stages: Sequence[Array]) -> Any:
     return sum(weight * stage for weight, stage in zip(weights, stages, strict=True))
+
+
+def _ended(before: Array, stages: Sequence[Array]) -> Array:
+    """Computes the end of a step: the point at which the last stage is evaluated, and this
+    stage."""
+    *others, last = stages
+    return before + _weighted(A[-1], others) + last
 
 
 def _factor(W: Array) -> list[Array]:
@@ -542,3 +584,8 @@ def _solve(W: Array, exchanged: Sequence[Array], b: Array) -> Array:
         b[k] /= W[k, k]
         b[:k] -= W[:k, k, None] * b[k]
     return b
+
+
+def _solved(W: Array, exchanged: Sequence[Array], b: Array) -> Array:
+    """Computes W^-1 b of every lane for vectors b (n, lanes)."""
+    return _solve(W, exchanged, b[:, None])[:, 0]
