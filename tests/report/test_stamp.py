@@ -106,7 +106,7 @@ def test_the_report_has_the_figures_and_formats_that_were_asked_for_last(
     assert kinds() == {"csv", "md", "tex"}
     mine.unlink()
     assert kinds() == {"csv", "md"}
-    assert {"cost_against_accuracy.pdf", "parameter_errors_linear_lse.png"} <= drawn()
+    assert {"cost_against_accuracy.pdf", "convergence.png"} <= drawn()
     assert {name.rpartition(".")[2] for name in drawn()} == {"png", "pdf"}
     assert main([*report, "figures=none"]) == 0
     assert drawn() == set()

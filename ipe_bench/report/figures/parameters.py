@@ -30,6 +30,10 @@ _ENDS = ("rmse_solved_low", "rmse_solved_high")
 
 
 def draw(view: View) -> Iterator[Drawing]:
+    """Draws the errors of the reference and of an estimator that iterates, over the error scales;
+    of a single scale the table says it all."""
+    if len(view.scales) < 2:
+        return
     iterated = [e for e in view.look if view.equations[e] == "frozen"]
     iterated.sort(key=lambda e: e != "fixed_point")
     for label in (REFERENCE, *iterated[:1]):
@@ -44,8 +48,6 @@ def _of_one(view: View, estimator: str) -> Drawing:
     totals = view.totals[view.totals["estimator"] == estimator].assign(parameter=ALL)
     groups = _groups(view.parameters)
     fig, axes = common.panels(len(groups) + 1, height=2.4)
-    if len(view.scales) == 1:
-        fig.set_figheight(fig.get_figheight() + 0.08 * len(view.parameters))
     for (group, inside), ax in zip(groups.items(), axes, strict=False):
         _draw_group(ax, rows, view, group, inside)
     _draw_ratios(axes[-1], rows, totals, view)
@@ -65,28 +67,17 @@ def _of_one(view: View, estimator: str) -> Drawing:
 def _draw_group(
     ax: Any, rows: pd.DataFrame, view: View, group: str, inside: Sequence[Mapping[str, Any]]
 ) -> None:
-    """Draws the errors of a group's parameters with their bounds: over the scales, or a row for
-    each."""
-    several = len(view.scales) > 1
+    """Draws the errors of a group's parameters over the scales, with their bounds."""
     look: dict[str, Look] = {}
     for i, parameter in enumerate(inside):
         look[parameter["name"]] = Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)])
-    if not several:
-        common.name_axis(ax, list(look))
     part = rows[rows["parameter"].isin(list(look))]
-    common.decades(
-        ax,
-        part[["rmse_solved", "linear_bound"]],
-        ends=part[[*_ENDS]],
-    )
-    for i, (name, one) in enumerate(look.items()):
+    common.decades(ax, part[["rmse_solved", "linear_bound"]], ends=part[[*_ENDS]])
+    for name, one in look.items():
         own = part[part["parameter"] == name].sort_values("error_scale")
         style: Any = {"color": one.color, "linestyle": BOUND_DASH, "linewidth": 1.0}
-        if several:
-            ax.plot(own["error_scale"], own["linear_bound"], **style)
-        else:
-            ax.vlines(own["linear_bound"], i - 0.3, i + 0.3, **style)
-    has_legend = len(inside) > 1 and several
+        ax.plot(own["error_scale"], own["linear_bound"], **style)
+    has_legend = len(inside) > 1
     if has_legend:
         low, high = ax.get_ylim()
         room = 0.05 * (len(inside) + 1)
@@ -109,16 +100,12 @@ def _name_parameters(ax: Any, look: Mapping[str, Look]) -> None:
 
 def _draw_ratios(ax: Any, rows: pd.DataFrame, totals: pd.DataFrame, view: View) -> None:
     """Draws the errors over their linear bounds, of all parameters together and each in grey."""
-    several = len(view.scales) > 1
     ratio = rows["rmse_solved_over_linear_bound"]
-    if not several:
-        common.name_axis(ax, [ALL])
     values = np.append(ratio, [1.0, *totals["rmse_solved"]])
     common.decades(ax, values, ends=totals[[*_ENDS]])
-    if several:
-        grey = {parameter["name"]: Look(GREY, ",") for parameter in view.parameters}
-        _curves(ax, rows.assign(rmse_solved=ratio), grey, view)
-        ax.plot([], [], color=GREY, label="each parameter")
+    grey = {parameter["name"]: Look(GREY, ",") for parameter in view.parameters}
+    _curves(ax, rows.assign(rmse_solved=ratio), grey, view)
+    ax.plot([], [], color=GREY, label="each parameter")
     _curves(ax, totals, {ALL: Look(BLACK, "o")}, view, "all parameters", "bounds")
     common.bound_line(ax, 1.0, "linear bound, eq. (5)")
 
@@ -145,17 +132,10 @@ def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[s
 
 
 def _curves(ax: Any, rows: Any, look: Any, view: View, heading: str = "", unit: str = "") -> None:
-    given: Any = {"by": "parameter", "trials": "solved_trials", "heading": heading}
-    given["label"] = common.text(with_unit("rms error", unit))
-    common.curves(
-        ax,
-        rows,
-        "rmse_solved",
-        look,
-        view.scales,
-        interval=_ENDS,
-        **given,
-    )
+    label = common.text(with_unit("rms error", unit))
+    words: Any = {"by": "parameter", "heading": heading, "label": label}
+    numbers: Any = {"trials": "solved_trials", "interval": _ENDS}
+    common.curves(ax, rows, "rmse_solved", look, view.scales, **words, **numbers)
 
 
 def _missing(totals: pd.DataFrame) -> str:
