@@ -70,17 +70,17 @@ class Wording:
         """Words the options of one setting, without those that its classes lack and errors of the
         truth that are 0."""
         there = {c: v for c, v in values.items() if v != "-"}
-        errors = {c: v for c, v in there.items() if _of_truth(c) and c in self.units}
+        errors = {c: v for c, v in there.items() if is_of_truth(c) and c in self.units}
         if is_right or errors:
-            there = {c: v for c, v in there.items() if not _of_truth(c) or c in errors}
+            there = {c: v for c, v in there.items() if not is_of_truth(c) or c in errors}
         told = [self._one(c, v) for c, v in there.items() if c not in errors or v != "0"]
-        if is_right and any(map(_of_truth, values)):
+        if is_right and any(map(is_of_truth, values)):
             told.append(RIGHT)
         return ", ".join(told)
 
     def _one(self, column: str, value: str) -> str:
         unit = self.units.get(column, "")
-        if unit and _of_truth(column):
+        if unit and is_of_truth(column):
             return f"{last_words(column)} {value} {unit}"
         return f"{assignments({column: value})} {unit}".rstrip()
 
@@ -96,7 +96,8 @@ def last_words(column: str) -> str:
     return column.rpartition(".")[2].replace("_", " ")
 
 
-def _of_truth(column: str) -> bool:
+def is_of_truth(column: str) -> bool:
+    """Whether an option is one of the model that readings come from."""
     return column.partition(".")[0] == _TRUTH
 
 
