@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -52,13 +52,15 @@ class Wording:
         apart = varying(columns, rows)
         if not apart:
             return ["-"] * len(rows)
-        values = [{c: value_text(row.get(c)) for c in columns} for row in rows]
+        each = [{column: value_text(row.get(column)) for column in columns} for row in rows]
         usual: dict[str, str] = {}
         if len(apart) > MOST_SETTINGS:
-            usual = {c: _most_frequent([row[c] for row in values]) for c in apart if c != _TRUTH}
+            # The model of the truth is always told.
+            counted = [column for column in apart if column != _TRUTH]
+            usual = {column: _most_frequent(row[column] for row in each) for column in counted}
         settings = []
-        for row in values:
-            unusual = {c: row[c] for c in apart if row[c] != usual.get(c)}
+        for row in each:
+            unusual = {column: row[column] for column in apart if row[column] != usual.get(column)}
             settings.append(self.worded(unusual, is_right=self.is_right(row)) or "-")
         return settings
 
@@ -69,11 +71,17 @@ class Wording:
     def worded(self, values: Mapping[str, str], *, is_right: bool = False) -> str:
         """Words the options of one setting, without those that its classes lack and errors of the
         truth that are 0."""
-        there = {c: v for c, v in values.items() if v != "-"}
-        errors = {c: v for c, v in there.items() if is_of_truth(c) and c in self.units}
-        if is_right or errors:
-            there = {c: v for c, v in there.items() if not is_of_truth(c) or c in errors}
-        told = [self._one(c, v) for c, v in there.items() if c not in errors or v != "0"]
+        there = {column: value for column, value in values.items() if value != "-"}
+        errors = [column for column in there if is_of_truth(column) and column in self.units]
+        # Errors in words say all that is to be said of the truth; of the right model there is none.
+        names_truth = not (is_right or errors)
+        told = []
+        for column, value in there.items():
+            is_told = names_truth or not is_of_truth(column)
+            if column in errors:
+                is_told = value != "0"
+            if is_told:
+                told.append(self._one(column, value))
         if is_right and any(map(is_of_truth, values)):
             told.append(RIGHT)
         return ", ".join(told)
@@ -85,7 +93,7 @@ class Wording:
         return f"{assignments({column: value})} {unit}".rstrip()
 
 
-def _most_frequent(texts: Sequence[str]) -> str:
+def _most_frequent(texts: Iterable[str]) -> str:
     """Returns the first, in alphabetical order, of those that occur most often."""
     counts = Counter(sorted(texts))
     return counts.most_common(1)[0][0]
