@@ -138,15 +138,8 @@ def _package_version(package: str) -> str:
     return "none"
 
 
-@functools.cache
-def _distributions() -> dict[str, list[str]]:
-    """Returns the names of the distributions that hold each top-level package."""
-    # To read what all of them hold takes .04 s. Who installs another writes its folder anew.
-    metadata = [found for folder in sys.path for found in sorted(Path(folder).glob("*-info"))]
-    times = [(str(found), found.stat().st_mtime_ns) for found in metadata]
-    read = importlib.metadata.packages_distributions
-    held = kept(repr((sys.version, times)), ".json", lambda: json.dumps(read()).encode())
-    return json.loads(held)
+_distributions = functools.cache(importlib.metadata.packages_distributions)
+"""Returns the names of the distributions that hold each top-level package."""
 
 
 def _import_closure(module: str) -> frozenset[str]:

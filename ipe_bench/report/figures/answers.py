@@ -120,11 +120,9 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
         common.title(ax, f"{names}: {_tests(first)}")
     common.axis_labels(fig, common.text(heading), "residual / its deviation")
     common.legend(fig, axes)
-    every = [one for group in shown for one in group]
-    counts = [f"{one.label} {int(one.outliers.sum())}" for one in every]
     caption = (
         "Each is standard normal if the model and the noise are right. Beyond"
-        f" ±{limit:.2f} a reading is an outlier: {enumerate_few(counts, 3)}."
+        f" ±{limit:.2f} a reading is an outlier."
     )
     further = len(groups) - len(shown)
     if further:

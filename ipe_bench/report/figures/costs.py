@@ -3,7 +3,7 @@ the limit."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import Figure, View
 from ipe_bench.report.style import GREY, MARKERS, Look
-from ipe_bench.report.words import enumerate_few, short, value_text
+from ipe_bench.report.words import value_text
 from ipe_bench.statistics.sample import CLOSE
 
 LEAST_COST = 0.5
@@ -52,7 +52,6 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         "Cost against accuracy, all trials",
         "Lower left is better.",
         common.left_out(view.scales, panels),
-        _cheapest(rows, view.scales[-1]),
     )
 
 
@@ -89,18 +88,6 @@ def _mark(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look]) -> None:
     for name, lost in rows[rows["over"]].groupby("estimator", sort=False):
         one = look[str(name)]
         common.beyond(ax, lost["cost"], lost["error"], one)
-
-
-def _cheapest(rows: pd.DataFrame, scale: float) -> str:
-    """Names the estimator that reaches about the least error at a scale for the fewest simulations;
-    nobody where all are lost."""
-    here = rows[rows["error_scale"] == scale]
-    if here["error"].min() >= _HIGHEST:
-        return ""
-    good = here[here["error"] <= here["error"].min() * 1.05]
-    best = good.sort_values("simulations_median", kind="stable").iloc[0]
-    who = f"{best['estimator']}, {short(best['simulations_median'])} simulations"
-    return f"Cheapest within 5 % of the least error at scale {value_text(scale)}: {who}."
 
 
 def draw_convergence(view: View) -> Iterator[Drawing]:
@@ -142,7 +129,6 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
         "convergence",
         "Convergence, converged trials",
         "Median of the largest component of the distance to the last iterate.",
-        _arrivals(rows, look, scales[-1]),
         f"{hidden} more are not shown." if hidden else "",
     )
 
@@ -165,16 +151,6 @@ def _approach(ax: Any, rows: pd.DataFrame, by_scale: Mapping[str, Look], label: 
     else:
         ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         common.title(ax, label)
-
-
-def _arrivals(rows: pd.DataFrame, look: Iterable[str], scale: float) -> str:
-    """Says after how many iterations estimators are close to their limit at a scale."""
-    here = rows[rows["error_scale"] == scale]
-    far = here[here["distance"] > CLOSE]
-    last = far.groupby("estimator", sort=False)["iteration"].max()
-    present = set(here["estimator"])
-    seen = [f"{label} {last.get(label, -1) + 1:g}" for label in look if label in present]
-    return f"Iterations to {CLOSE:g} σ at scale {value_text(scale)}: {enumerate_few(seen, 2)}."
 
 
 FIGURES = (

@@ -16,7 +16,7 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.headline import chosen
 from ipe_bench.report.figures.views import Figure, View, in_focus, only
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, Look, print_width, strong
-from ipe_bench.report.words import brief, enumerate_few, value_text
+from ipe_bench.report.words import enumerate_few, value_text
 
 CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_mean": 30.0}
 """Errors beyond are drawn here: the size of a diverged error carries no information, and the bound
@@ -183,17 +183,12 @@ def draw_distributions(view: View) -> Iterator[Drawing]:
         common.log_ticks(ax.xaxis, low, high)
     common.axis_labels(fig, f"error over {view.reference}", "share of all trials")
     common.legend(fig, fig.axes, look)
-    top = view.scales[-1]
-    last = rows[(rows["error_scale"] == top) & (rows["probability"] == 0.99)]
-    ends = last[["estimator", "error"]].to_numpy()
-    seen = [f"{label} {brief(value) if value <= most else f'>{most:g}'}" for label, value in ends]
     yield view.drawing(
         fig,
         "distributions",
         "Distribution of errors, all trials",
         "Share of all trials with at most that error.",
         common.left_out(view.scales, panels),
-        f"99 % quantile at scale {value_text(top)}: {enumerate_few(seen, 2)}.",
     )
 
 

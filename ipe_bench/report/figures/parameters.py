@@ -21,7 +21,7 @@ from ipe_bench.report.style import (
     REFERENCE,
     Look,
 )
-from ipe_bench.report.words import brief, value_text
+from ipe_bench.report.words import value_text
 from ipe_bench.statistics.statistic import ALL
 
 MOST_GROUPS = 8
@@ -60,7 +60,6 @@ def _of_one(view: View, estimator: str) -> Drawing:
         f"{of_paper}error of {estimator}, solved trials",
         f"Root mean square error and 95 % interval of the trials solved ({_missing(totals)})."
         " Dotted: linear bounds.",
-        _together(totals),
     )
 
 
@@ -108,15 +107,6 @@ def _draw_ratios(ax: Any, rows: pd.DataFrame, totals: pd.DataFrame, view: View) 
     ax.plot([], [], color=GREY, label="each parameter")
     _curves(ax, totals, {ALL: Look(BLACK, "o")}, view, "all parameters", "bounds")
     common.bound_line(ax, 1.0, "linear bound, eq. (5)")
-
-
-def _together(totals: pd.DataFrame) -> str:
-    """States the error of all parameters at the largest scale that has one."""
-    known = totals[["error_scale", "rmse_solved"]].dropna()
-    if known.empty:
-        return ""
-    scale, error = known.to_numpy()[-1]
-    return f"All together: {brief(error)} at scale {value_text(scale)}."
 
 
 def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
