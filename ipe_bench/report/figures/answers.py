@@ -161,7 +161,6 @@ def _left_out(m: int) -> str:
 
 def _residual_panel(ax: Any, x: Array, fit: Fit, limit: float, color: str) -> None:
     """Draws the residuals of a fit over x (m,), outliers as crosses."""
-    import seaborn as sns
     from matplotlib.ticker import MaxNLocator
 
     r = fit.normalised
@@ -169,12 +168,12 @@ def _residual_panel(ax: Any, x: Array, fit: Fit, limit: float, color: str) -> No
     common.bound_line(ax, limit, "limit for outliers")
     common.bound_line(ax, -limit, "")
     good = np.isfinite(r) & ~fit.outliers & _drawn(len(x))
-    points: dict[str, Any] = {"color": color, "legend": False, "ax": ax}
-    many: Any = {"s": 9 if len(x) > 100 else 20, "rasterized": len(x) > _MANY}
-    sns.scatterplot(x=x[good], y=r[good], alpha=0.75, linewidth=0, **many, **points)
+    size = 9 if len(x) > 100 else 20
+    points: Any = {"s": size, "alpha": 0.75, "linewidth": 0, "rasterized": len(x) > _MANY}
+    ax.scatter(x[good], r[good], color=color, **points)
     if fit.outliers.any():
-        points |= {"s": 25, "marker": "x", "linewidth": 1.2, "label": "outlier"}
-        sns.scatterplot(x=x[fit.outliers], y=r[fit.outliers], **points)
+        crosses: Any = {"s": 25, "marker": "x", "linewidth": 1.2, "label": "outlier"}
+        ax.scatter(x[fit.outliers], r[fit.outliers], color=color, **crosses)
     largest = float(np.nanmax(np.abs(r)))
     edge = 1.15 * max(largest, limit)
     ax.set_ylim(-edge, edge)

@@ -424,38 +424,20 @@ def mark_cut(ax: Axes, place: Any, edge: float, color: str, *, downwards: bool) 
     _arrows(ax, *at, color, points=-4, downwards=downwards)
 
 
-def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, Any]:
-    """Arguments of seaborn's functions that give every label its own colour and marker; grey ones
-    lie below."""
-    order = sorted(look, key=lambda label: look[label].color != GREY)
-    style: dict[str, Any] = {
-        "hue": by,
-        "hue_order": order,
-        "style": by,
-        "style_order": order,
-        "legend": False,
-    }
-    style["palette"] = {label: one.color for label, one in look.items()}
-    style["markers"] = {label: one.marker for label, one in look.items()}
-    return style
-
-
 def lines(
     ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], **style: Any
 ) -> None:
-    """Draws a line per estimator through dense points, with a few markers, staggered so that
-    coinciding lines are seen."""
-    import seaborn as sns
-
-    before = len(ax.lines)
-    dashes = {label: one.dash for label, one in look.items()}
-    style = {**seaborn_style(look), "dashes": dashes, "estimator": None, "sort": False, **style}
-    sns.lineplot(rows, x=x, y=y, ax=ax, **style)
-    drawn = ax.lines[before:]
-    for i, line in enumerate(drawn):
+    """Draws a line per estimator through dense points, grey ones below, with a few markers,
+    staggered so that coinciding lines are seen."""
+    there = set(rows["estimator"])
+    drawn = {name: one for name, one in look.items() if name in there}
+    grey_first = sorted(drawn, key=lambda name: drawn[name].color != GREY)
+    for i, name in enumerate(grey_first):
+        own = rows[rows["estimator"] == name]
+        one = drawn[name]
         first = 0.05 + 0.25 * i / len(drawn)
-        line.set_markevery([] if line.get_color() == GREY else (first, 0.25))
-    ax.set(xlabel="", ylabel="")
+        marked = [] if one.color == GREY else (first, 0.25)
+        ax.plot(own[x], own[y], markevery=marked, **(one.line | style))
 
 
 class _Points(NamedTuple):

@@ -135,13 +135,12 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
 
 def _approach(ax: Any, rows: pd.DataFrame, by_scale: Mapping[str, Look], label: str) -> None:
     """Draws one estimator's distances by iterations, a line per scale."""
-    import seaborn as sns
     from matplotlib.ticker import MaxNLocator
 
     end = int(rows["iteration"].max())
-    style = common.seaborn_style(by_scale, "scale")
-    style |= {"dashes": False, "estimator": None, "linewidth": 1.2, "markevery": 1 + end // 12}
-    sns.lineplot(rows, x="iteration", y="distance", ax=ax, **style)
+    for scale, one in by_scale.items():
+        own = rows[rows["scale"] == scale]
+        ax.plot(own["iteration"], own["distance"], markevery=1 + end // 12, **one.line)
     ax.set_yscale("log")
     common.bound_line(ax, CLOSE, f"{CLOSE:g} standard deviations")
     ax.set_xlim(-0.03 * end - 0.2, 1.03 * end + 0.2)

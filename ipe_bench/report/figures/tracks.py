@@ -107,7 +107,7 @@ def _draw_nees(
     if known.empty:
         ax.set_axis_off()
         return []
-    common.lines(ax, known, "at", "nees_solved", look, legend=False)
+    common.lines(ax, known, "at", "nees_solved", look)
     low = known["nees_low_if_honest"].min()
     high = known["nees_high_if_honest"].max()
     common.band(ax, low, high, "95 % limits for a right covariance")
