@@ -51,41 +51,62 @@ def draw_log(log: Log, tracks: Sequence[LogTracks], name: str = "track") -> Iter
     states = model.states[:MOST_STATES]
     read = directly_read(model)
     filters = [group for group in groups if np.isfinite(group[0].nis).any()]
-    foretold = _predicted(filters)
     # A state that is read directly has its readings in its own panel.
-    rest = [j for j in foretold if read.get(j, model.n) >= len(states)]
-    shown = {group[0].label: group[0].tracker for group in groups}
-    colors = looks_of(shown)
+    rest = [j for j in _predicted(filters) if read.get(j, model.n) >= len(states)]
+    colors = looks_of({group[0].label: group[0].tracker for group in groups})
     look = {_name(group): Look(colors[group[0].label].color, "") for group in groups}
     fig, axes = common.panels(len(states) + len(rest) + bool(filters), look, height=2.0, row=2)
-    for i, (state, ax) in enumerate(zip(states, axes, strict=False)):
-        own = [j for j, state_read in read.items() if state_read == i]
-        bands = {
-            _name(group): _Band(group[0].mean[:, i], group[0].deviation[:, i]) for group in groups
-        }
-        periods = [model.periods[j] for j in own if model.periods]
-        # Angles are drawn by the turn that is nearest to the track.
-        to = groups[0][0].mean[:, [i]] / state.size
-        readings = state.size * nearest(log.z[:, own], to, periods)
-        _draw_bands(ax, model.times, bands, look, readings)
-        _mark_left_out(ax, log, own, groups[0][0], readings)
-        common.title(ax, with_unit(state.name, state.unit))
-    for j, ax in zip(rest, axes[len(states) :], strict=False):
-        _draw_predictions(ax, log, j, filters, look)
-    words = [_draw_nis(axes[-1], log, group[0]) for group in filters[:1]]
+    panels = iter(axes)
+    for i in range(len(states)):
+        own = [j for j, state in read.items() if state == i]
+        _draw_state(next(panels), log, i, own, groups, look)
+    for j in rest:
+        _draw_predictions(next(panels), log, j, filters, look)
+    words = [_draw_nis(next(panels), log, group[0]) for group in filters[:1]]
     for ax in axes:
         ax.set_xlabel("time [s]")
         ax.margins(x=0.01)
     common.legend(fig, axes, look)
+    names = enumerate_few(list(look))
+    title = f"{names}: states ± {BAND:g} standard deviations"
+    caption = " ".join([*words, *_not_drawn(model, groups, tracks)])
+    yield Drawing(name, title, caption, fig)
+
+
+def _draw_state(
+    ax: Axes,
+    log: Log,
+    i: int,
+    own: Sequence[int],
+    groups: Sequence[Sequence[LogTracks]],
+    look: dict[str, Look],
+) -> None:
+    """Draws a state by every tracker, with its `own` readings if it is read directly."""
+    state = log.model.states[i]
+    first = groups[0][0]
+    bands = {}
+    for group in groups:
+        bands[_name(group)] = _Band(group[0].mean[:, i], group[0].deviation[:, i])
+    # Angles are drawn by the turn that is nearest to the track.
+    periods = [log.model.periods[j] for j in own if log.model.periods]
+    to = first.mean[:, [i]] / state.size
+    readings = state.size * nearest(log.z[:, own], to, periods)
+    _draw_bands(ax, log.model.times, bands, look, readings)
+    _mark_left_out(ax, log, own, first, readings)
+    common.title(ax, with_unit(state.name, state.unit))
+
+
+def _not_drawn(
+    model: StateModel, groups: Sequence[Sequence[LogTracks]], tracks: Sequence[LogTracks]
+) -> Iterator[str]:
+    """Says which tracks are not drawn, and how many states."""
     drawn = {one.label for group in groups for one in group}
     left = [one.label for one in tracks if one.label not in drawn]
     if left:
-        words.append(f"Not drawn: {enumerate_few(left)}.")
-    if model.n > len(states):
-        words.append(f"{model.n - len(states)} further states are in track.csv.")
-    names = enumerate_few([_name(group) for group in groups])
-    title = f"{names}: states ± {BAND:g} standard deviations"
-    yield Drawing(name, title, " ".join(words), fig)
+        yield f"Not drawn: {enumerate_few(left)}."
+    further = model.n - MOST_STATES
+    if further > 0:
+        yield f"{further} further states are in track.csv."
 
 
 def _predicted(filters: Sequence[Sequence[LogTracks]]) -> list[int]:
