@@ -1,11 +1,12 @@
 """Other people's integrators on the equations of a model by differential equations, batched as each
-does it best.
+does it best, and their filters of states.
 
-They come with the extra `peers`; a library that is not installed has no row. Each is told an
+They come with the extra `peers`; an integrator that is not installed has no row. Each is told an
 accuracy at which its readings are within the tolerance that ours hold, which the caller checks
 before it takes the time.
 """
 
+import importlib
 import importlib.util
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +19,7 @@ from ipe_bench.engine.equations import Recording
 from ipe_bench.engine.tableaus import DOP853
 from ipe_bench.engine.trace import Program
 from ipe_bench.measurements.ode.model import OdeMeasurement
+from ipe_bench.states.base import Normal
 
 Simulate = Callable[[Array], Array]
 _FUSED = {
@@ -167,6 +169,21 @@ def _moved(y: list[Any], h: Any, weights: Sequence[float], k: list[list[Any]]) -
     return [
         v + h * sum(w * slope[i] for w, slope in terms) if terms else v for i, v in enumerate(y)
     ]
+
+
+def extended_filter(
+    step: Callable[[Any], Any], seen: Callable[[Any], Any], first: Normal, Q: Array, R: Array
+) -> Callable[[Array], Array] | None:
+    """Makes the extended filter of dynamax, readings (trials, K, m) to means (trials, K, n), of
+    functions that are written for JAX and states that are `first` at the first reading; None if it
+    is not installed."""
+    if not importlib.util.find_spec("dynamax"):
+        return None
+    jax = _jax()
+    ssm: Any = importlib.import_module("dynamax.nonlinear_gaussian_ssm")
+    model = ssm.ParamsNLGSSM(first.mean, first.covariance, step, Q, seen, R)
+    batched = jax.jit(jax.vmap(lambda z: ssm.extended_kalman_filter(model, z).filtered_means))
+    return lambda z: np.asarray(batched(z))
 
 
 def _jax() -> Any:
