@@ -9,14 +9,8 @@ import numpy as np
 
 from ipe_bench.engine.rows import RowFunction
 from ipe_bench.engine.trace import Expression, RowPrograms, in_order, substitute
-from ipe_bench.functions.unknowns import (
-    ExactGraph,
-    Refused,
-    Unknown,
-    is_unknown,
-    objects,
-    unknowns,
-)
+from ipe_bench.functions.exact import ExactGraph, Refused
+from ipe_bench.functions.unknowns import Unknown, is_unknown, objects, unknowns
 
 _MOST_OPERATIONS = 20_000
 """Operations of a function, with its tangents, at most: they take ten seconds to compile, once per

@@ -1,5 +1,10 @@
 """Numbers and arrays that are not known while a function of NumPy is recorded.
 
+A function is called once, with an array of unknowns in place of its argument. NumPy asks what it
+meets how to go on: an `Unknown` is a single number, which notes each operation in a graph; an
+`Unknowns` is an array of them. Operators and ufuncs, such as np.sin, come to `call`, entry by
+entry; other functions of NumPy, such as np.where or np.cumsum, to `_function`.
+
 What an unknown cannot do as a number does raises `Refused` and marks the graph, since a bare
 `except` of a user catches even that.
 """
@@ -7,62 +12,13 @@ What an unknown cannot do as a number does raises `Refused` and marks the graph,
 from __future__ import annotations
 
 import functools
-import math
-import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from ipe_bench.engine.trace import COMPOSED, FUNCTIONS, Expression, Graph, computed
-
-_HUGE = sys.float_info.max
-
-
-class Refused(BaseException):
-    """Says that an unknown met something that needs its number."""
-
-
-class ExactGraph(Graph):
-    """Holds the operations of a function as NumPy does them: 0 x is 0 only where x is finite."""
-
-    def __init__(self, most: float = math.inf) -> None:
-        super().__init__(most)
-        self.exact = True
-        """Whether operations stay as they are; tangents may be simplified."""
-        self.refused = ""
-        """Why the function cannot be recorded."""
-
-    def apply(self, operation: str, *operands: Any) -> Expression:
-        if not self.exact:
-            return super().apply(operation, *operands)
-        args = [a if type(a) is Expression else self.constant(a) for a in operands]
-        constant = [a.operation == "constant" for a in args]
-        if not any(constant):
-            return self._node(operation, *args)
-        values = [a.value for a in args]
-        if all(constant):
-            with np.errstate(all="ignore"):
-                return self.constant(float(computed(operation, *map(np.float64, values))))
-        match operation, values:
-            case ("pow", [_, 0.0] | [1.0, _]):
-                return self.constant(1.0)
-            case ("mul" | "div" | "pow", [_, 1.0]) | ("add" | "sub", [_, 0.0]):
-                return args[0]
-            case ("mul", [1.0, _]) | ("add", [0.0, _]):
-                return args[1]
-            case ("pow", [_, 2.0]):
-                return self._node("mul", args[0], args[0])
-            case ("pow", [_, 0.5]):
-                return self._node("sqrt", args[0])
-            case ("where", [float(condition), _, _]):
-                return args[1] if condition else args[2]
-        return self._node(operation, *args)
-
-    def refuse(self, what: str) -> Refused:
-        """Returns what is to be raised, and keeps the first reason."""
-        self.refused = self.refused or what
-        return Refused(what)
+from ipe_bench.engine.trace import Expression
+from ipe_bench.functions.exact import HUGE, OPERATIONS, SAME, TRUTHS, ExactGraph
 
 
 def _unary(name: str) -> Any:
@@ -152,7 +108,7 @@ class Unknown:
             raise AttributeError(name)
         if name in ("real", "T"):
             return self
-        if name in _OPERATIONS:  # NumPy calls the method of each object in an array
+        if name in OPERATIONS:  # NumPy calls the method of each object in an array
             return lambda *others: call(name, self, *others)
         raise self.node.graph.refuse(f".{name} of its argument is not recorded")
 
@@ -165,38 +121,35 @@ def _is_truth(value: Any) -> bool:
     return value.truth if is_unknown(value) else type(value) in (bool, np.bool_)
 
 
+_OF_TRUTHS_ALONE = ("bitwise_and", "bitwise_or", "bitwise_xor", "logical_xor")
+"""Functions that of numbers are errors, or are something else."""
+_ASKED = {"logical_and": 2, "logical_or": 2, "where": 1}
+"""How many arguments of a function, from the first on, are asked whether they hold."""
+
+
 def call(name: str, *given: Any) -> Any:
     """Applies a function of NumPy to unknowns and numbers."""
-    graph = next(one.node.graph for one in given if type(one) is Unknown)
-    if name in _OF_TRUTHS_ALONE and not all(map(_is_truth, given)):
+    graph = next(one.node.graph for one in given if is_unknown(one))
+    truths = [_is_truth(one) for one in given]
+    if name in _OF_TRUTHS_ALONE and not all(truths):
         raise graph.refuse(f"np.{name} of numbers is not recorded")
-    name = _SAME.get(name, name)
-    if name not in _OPERATIONS:
+    name = SAME.get(name, name)
+    if name not in OPERATIONS:
         raise graph.refuse(f"np.{name} is not recorded")
-    truths = []
-    nodes = []
-    for one in given:
-        if type(one) is Unknown:
-            truths.append(one.truth)
-            nodes.append(one.node)
-        elif isinstance(one, np.ndarray):
-            return NotImplemented
-        else:
-            truths.append(type(one) in (bool, np.bool_))
-            nodes.append(_number(graph, one))
-    if True in truths:
+    if any(isinstance(one, np.ndarray) for one in given):
+        return NotImplemented
+    nodes = [one.node if is_unknown(one) else _number(graph, one) for one in given]
+    if any(truths):
         name = _of_truths(graph, name, truths)
     elif name == "invert":
         raise graph.refuse("~ of a number is not recorded")
     # Where a truth is asked for, a number holds unless it is 0.
     for i in range(_ASKED.get(name, 0)):
         if not truths[i]:
-            nodes[i] = _OPERATIONS["not_equal"](graph.apply, nodes[i], 0.0)
-    made = _OPERATIONS[name](graph.apply, *nodes)
-    return Unknown(made, name in _TRUTHS or (name == "where" and all(truths[1:])))
-
-
-_ASKED = {"logical_and": 2, "logical_or": 2, "where": 1}
+            nodes[i] = OPERATIONS["not_equal"](graph.apply, nodes[i], 0.0)
+    made = OPERATIONS[name](graph.apply, *nodes)
+    chosen = name == "where" and all(truths[1:])
+    return Unknown(made, name in TRUTHS or chosen)
 
 
 def _of_truths(graph: ExactGraph, name: str, truths: Sequence[bool]) -> str:
@@ -205,7 +158,7 @@ def _of_truths(graph: ExactGraph, name: str, truths: Sequence[bool]) -> str:
         return name
     if name in ("subtract", "negative"):
         raise graph.refuse(f"np.{name} of truth values is an error")
-    if name in _TRUTHS or name == "where":
+    if name in TRUTHS or name == "where":
         return name
     if name in ("add", "maximum", "fmax"):
         return "logical_or"
@@ -220,91 +173,6 @@ def _number(graph: ExactGraph, one: Any) -> Expression:
     if not isinstance(one, bool | int | float | np.bool_ | np.number):
         raise graph.refuse(f"its argument meets {type(one).__name__}, which is no number")
     return graph.constant(float(one))
-
-
-_SAME = {
-    "true_divide": "divide",
-    "bitwise_and": "logical_and",
-    "bitwise_or": "logical_or",
-    "bitwise_xor": "not_equal",
-    "logical_xor": "not_equal",
-    "logical_not": "invert",
-    "fabs": "absolute",
-    "mod": "remainder",
-    "conjugate": "positive",
-    "deg2rad": "radians",
-    "rad2deg": "degrees",
-    "float_power": "power",
-}
-_OF_TRUTHS_ALONE = ("bitwise_and", "bitwise_or", "bitwise_xor", "logical_xor")
-"""Functions that of numbers are errors, or are something else."""
-_TRUTHS = {
-    *("less", "less_equal", "greater", "greater_equal", "equal", "not_equal"),
-    *("logical_and", "logical_or", "invert", "isnan", "isfinite", "isinf"),
-}
-
-
-def _not(apply: Any, a: Any) -> Any:
-    return apply("sub", 1.0, a)
-
-
-def _or(apply: Any, a: Any, b: Any) -> Any:
-    return _not(apply, apply("mul", _not(apply, a), _not(apply, b)))
-
-
-def _finite(apply: Any, a: Any) -> Any:
-    return apply("mul", apply("less_equal", a, _HUGE), apply("less_equal", -_HUGE, a))
-
-
-def _infinite(apply: Any, a: Any) -> Any:
-    return apply("mul", apply("less_equal", a, a), _not(apply, _finite(apply, a)))
-
-
-def _ignoring(name: str) -> Any:
-    """Returns fmin or fmax: of two, the one that is a number."""
-
-    def chosen(apply: Any, a: Any, b: Any) -> Any:
-        both = apply("where", apply("less_equal", b, b), COMPOSED[name](apply, a, b), a)
-        return apply("where", apply("less_equal", a, a), both, b)
-
-    return chosen
-
-
-def _clipped(apply: Any, a: Any, low: Any, high: Any) -> Any:
-    return COMPOSED["minimum"](apply, COMPOSED["maximum"](apply, a, low), high)
-
-
-def _plainly(name: str) -> Any:
-    return lambda apply, *given: apply(name, *given)
-
-
-_OPERATIONS: dict[str, Callable[..., Any]] = {
-    **COMPOSED,
-    **{
-        name: _plainly(name)
-        for name in (
-            *FUNCTIONS,
-            *("less", "less_equal", "floor", "arctan2", "where", "remainder"),
-        )
-    },
-    "add": _plainly("add"),
-    "subtract": _plainly("sub"),
-    "multiply": _plainly("mul"),
-    "divide": _plainly("div"),
-    "power": _plainly("pow"),
-    "negative": _plainly("neg"),
-    "positive": lambda apply, a: a,
-    "logical_and": _plainly("mul"),
-    "logical_or": _or,
-    "invert": _not,
-    "isnan": lambda apply, a: _not(apply, apply("less_equal", a, a)),
-    "isfinite": _finite,
-    "isinf": _infinite,
-    "fmin": _ignoring("minimum"),
-    "fmax": _ignoring("maximum"),
-    "clip": _clipped,
-}
-"""What is recorded of NumPy, in operations of a graph."""
 
 
 class Unknowns(np.ndarray):
@@ -323,7 +191,8 @@ class Unknowns(np.ndarray):
     def __array_ufunc__(
         self, ufunc: np.ufunc, method: str, *inputs: Any, out: Any = None, **kwargs: Any
     ) -> Any:
-        graph = next(i.graph for i in (*inputs, *(out or ())) if isinstance(i, Unknowns))
+        met = [*inputs, *(out or ())]
+        graph = next(one.graph for one in met if isinstance(one, Unknowns))
         name = ufunc.__name__
         # What np.mean and the like say beside, and numbers need not be told.
         kwargs.pop("casting", None)
@@ -331,7 +200,8 @@ class Unknowns(np.ndarray):
         if kwargs.get("where") is True:
             kwargs.pop("where")
         kind = kwargs.pop("dtype", None)
-        if kind not in (None, float, np.dtype(float)) and name not in ("logical_or", "logical_and"):
+        plain = kind in (None, float, np.dtype(float))
+        if not plain and name not in ("logical_or", "logical_and"):
             raise graph.refuse(f"np.{name} with a dtype is not recorded")
         if method == "__call__" and ufunc.signature:  # matrix products, of operators
             found = ufunc(*map(objects, inputs), **kwargs)
@@ -359,7 +229,8 @@ class Unknowns(np.ndarray):
         return super().__getitem__(key)
 
     def __setitem__(self, key: Any, value: Any) -> None:
-        if isinstance(key, Unknowns) and key.shape == self.shape and np.ndim(value) == 0:
+        by_entry = isinstance(key, Unknowns) and key.shape == self.shape
+        if by_entry and np.ndim(value) == 0:
             chosen = _by_entry(_where, objects(key), value, objects(self))
             self[...] = unknowns(chosen, self.graph)
         elif _has_unknowns(key):
@@ -399,14 +270,19 @@ def _kept(found: Any, graph: ExactGraph) -> Any:
 
 
 def _by_entry(function: Callable[..., Any], *arrays: Any) -> Any:
-    return objects(np.frompyfunc(function, len(arrays), 1)(*map(objects, arrays)))
+    each = np.frompyfunc(function, len(arrays), 1)
+    return objects(each(*map(objects, arrays)))
 
 
 def _counted(array: Any) -> Any:
     """Returns truth values as the numbers 1 and 0."""
     if not any(_is_truth(one) for one in array.ravel()):
         return array
-    return _by_entry(lambda a: call("multiply", a, 1.0) if is_unknown(a) else float(a), array)
+
+    def number(a: Any) -> Any:
+        return call("multiply", a, 1.0) if is_unknown(a) else float(a)
+
+    return _by_entry(number, array)
 
 
 def _has_unknowns(key: Any) -> bool:
@@ -441,7 +317,8 @@ def _gathered(ufunc: np.ufunc, method: str, inputs: Sequence[Any], kwargs: dict[
     first = objects(inputs[0])
     if ufunc.__name__ == "add":
         first = _counted(first)
-    if method == "reduce" and kwargs.get("axis", 0) is None and not kwargs.get("keepdims"):
+    over_all = kwargs.get("axis", 0) is None and not kwargs.get("keepdims")
+    if method == "reduce" and over_all:
         first = first.ravel()
         kwargs["axis"] = 0
     return getattr(function, method)(first, *inputs[1:], **kwargs)
@@ -454,7 +331,8 @@ _MOVING = """
     ones_like outer polyval prod ravel repeat reshape roll shape sinc size split squeeze stack sum
     swapaxes take tensordot tile trace transpose tril triu vstack zeros_like
 """
-_MOVED = {getattr(np, name) for name in _MOVING.split()} | {np.linalg.matmul, np.linalg.outer}
+_MOVED = {getattr(np, name) for name in _MOVING.split()}
+_MOVED |= {np.linalg.matmul, np.linalg.outer}
 """Functions of NumPy that move entries, or add, multiply and compare them by operators."""
 
 
@@ -490,8 +368,11 @@ def _interp(x: Any, xp: Any, fp: Any) -> Any:
     values = np.asarray(fp, dtype=float)
     slopes = np.diff(values) / np.diff(places)
     found = np.where(np.isnan(x), x, values[0])
-    for left, value, slope in zip(places[:-1], values[:-1], slopes, strict=True):
-        found = np.where(x >= left, slope * (x - left) + value, found)
+    pieces = zip(places[:-1], values[:-1], slopes, strict=True)
+    for left, value, slope in pieces:
+        reached = x >= left
+        line = slope * (x - left) + value
+        found = np.where(reached, line, found)
     return np.where(x >= places[-1], values[-1], found)
 
 
@@ -511,7 +392,9 @@ def _std(x: Any, axis: Any = None, keepdims: bool = False) -> Any:
 
 
 def _without_nan(x: Any) -> Any:
-    finite = np.where(np.isinf(x), np.sign(x) * _HUGE, x)
+    infinite = np.isinf(x)
+    largest = np.sign(x) * HUGE
+    finite = np.where(infinite, largest, x)
     return np.where(np.isnan(x), 0.0, finite)
 
 
