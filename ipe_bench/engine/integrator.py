@@ -40,8 +40,14 @@ _NARROW = 4
 """Lanes up to which half of the usual vectors do: one simulation of GINS in two thirds of the
 time."""
 Integers = NDArray[np.integer[Any]]
-_INTEGERS = (3, 5, 6, 9, 11)
-_ARGUMENTS = tuple(INTEGER if place in _INTEGERS else POINTER for place in range(15))
+_ARGUMENTS = (
+    *(POINTER, POINTER, POINTER, INTEGER, POINTER),  # x, si, cases, n_cases, rows
+    *(INTEGER, INTEGER),  # first, last
+    *(POINTER, POINTER, INTEGER),  # times, steps, n_times
+    *(POINTER, INTEGER, POINTER),  # offset, stride, out
+    *(POINTER, POINTER),  # states, frame
+)
+"""Those of the function that `emit.integrator` describes."""
 
 
 def threads() -> int:
