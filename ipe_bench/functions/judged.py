@@ -135,7 +135,8 @@ class Judged:
         with np.errstate(all="ignore"):
             rough = self.roughness(x, here, J)
             beyond = ~(rough <= max(8 * _EPS, self.noise))
-            return (np.isfinite(here) & beyond).any(axis=1)
+            doubts: Mask = np.isfinite(here) & beyond
+            return np.logical_or.reduce(doubts, axis=1)
 
     def roughness(self, x: Array, here: Array, J: Array) -> Array:
         """Computes by which part of their terms the outputs (rows, m), which are `here`, move
