@@ -9,7 +9,6 @@ written in place of thousands of single operations; `part i` reads entry i of it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from llvmlite import ir
 
@@ -26,7 +25,7 @@ class Blocks(Vectors):
     def release(self) -> None:
         """Gives back all memory that was taken: written once, at the end of the function."""
         for taken in self.taken:
-            self.builder.call(self._of_library("free", VOID, PTR), [taken])
+            self.builder.call(self._declared("free", VOID, [PTR]), [taken])
 
     def apply(self, name: str, *args: Value) -> Value:
         match name.split():
@@ -145,13 +144,7 @@ class Blocks(Vectors):
         with b.goto_entry_block():
             # One vector more than is needed, of which the part before the border is left.
             size = integer(align * (count + 1))
-            taken = b.call(self._of_library("malloc", PTR, I64), [size])
+            taken = b.call(self._declared("malloc", PTR, [I64]), [size])
             self.taken.append(taken)
             end = b.add(b.ptrtoint(taken, I64), integer(align - 1))
             return b.inttoptr(b.and_(end, integer(-align)), PTR)
-
-    def _of_library(self, name: str, kind: ir.Type, given: ir.Type) -> Any:
-        """Returns a function of the C library, declared once a module."""
-        module = self.builder.module
-        known = module.globals.get(name)
-        return known or ir.Function(module, ir.FunctionType(kind, [given]), name)

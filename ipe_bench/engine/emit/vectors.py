@@ -159,21 +159,21 @@ class Vectors:
 
     def call(self, name: str, *args: Value) -> Value:
         """Writes an instruction of the processor: fma (rounded once), sqrt or floor."""
-        return self.builder.call(
-            self._declared(f"llvm.{name}.v{self.width}f64", self.type, len(args)), args
-        )
+        kinds = [self.type] * len(args)
+        function = self._declared(f"llvm.{name}.v{self.width}f64", self.type, kinds)
+        return self.builder.call(function, args)
 
     def _each(self, name: str, *args: Value) -> Value:
         """Calls a function of the C library, lane by lane."""
-        function = self._declared(name, F64, len(args))
+        function = self._declared(name, F64, [F64] * len(args))
         lanes = ([self.lane(a, i) for a in args] for i in range(self.width))
         return self.gathered(self.builder.call(function, numbers) for numbers in lanes)
 
-    def _declared(self, name: str, kind: ir.Type, count: int) -> ir.Function:
+    def _declared(self, name: str, kind: ir.Type, given: Sequence[ir.Type]) -> ir.Function:
+        """Returns a function that is compiled elsewhere, declared once a module."""
         module = self.builder.module
-        return module.globals.get(name) or ir.Function(
-            module, ir.FunctionType(kind, [kind] * count), name
-        )
+        known = module.globals.get(name)
+        return known or ir.Function(module, ir.FunctionType(kind, given), name)
 
 
 @contextmanager
