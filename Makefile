@@ -55,11 +55,12 @@ lowest newest: .venv/ready
 	outputs/$@/.venv/bin/python -m pytest -n auto --dist worksteal -W default
 
 # Whether the tests notice changes on purpose, as a table in outputs/mutants: those of tests/mutants/changes.py, all or
-# NAMES="margin-start minima-twice" of them. SAMPLE=40 draws that many changes by Cosmic Ray instead, room by room.
+# NAMES="margin-start minima-twice" of them. SAMPLE=40 draws that many changes by Cosmic Ray instead, room by room,
+# or of ROOMS="shown" alone; SEED=1 draws others.
 mutants: .venv/ready
 ifdef SAMPLE
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[mutants]"
-	$(BIN)/python tests/mutants/score.py --sample $(SAMPLE) $(ROOMS)
+	$(BIN)/python tests/mutants/score.py --sample $(SAMPLE) $(if $(SEED),--seed $(SEED)) $(ROOMS)
 else
 	$(BIN)/python tests/mutants/notice.py $(NAMES)
 endif

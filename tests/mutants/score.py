@@ -57,6 +57,16 @@ ROOMS = {
         ("functions/*.py", "states/along.py", "states/redone.py", "states/lost.py"),
         ("tests/functions", "tests/states/test_along.py", "tests/states/test_lost.py"),
     ),
+    "shown": (
+        (
+            *("report/figures/*.py", "report/tables/*.py", "report/finding.py"),
+            *("questions/design/*.py", "questions/posterior/*.py", "states/mirrored.py"),
+        ),
+        (
+            *("tests/report", "tests/questions/design", "tests/questions/posterior"),
+            *("tests/states/test_mirrored.py", "tests/statistics/test_verdicts.py"),
+        ),
+    ),
     "filters": (
         tuple(f"baselines/{name}.py" for name in ("kalman", "epochs", "sequential", "information")),
         ("tests/baselines/test_filters.py",),
