@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance, Mask, divisors, repeated
+from ipe_bench.basics.linalg import Array, Covariance, Mask, deviations, divisors, repeated
 from ipe_bench.estimators.driver import Limits
 from ipe_bench.estimators.least_squares import Objective, inverse_factor
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
@@ -345,22 +345,21 @@ def _estimated(
         U = np.concatenate([J, np.sqrt(2 * spare)[:, None] * L])
         inverse_U = inverse_factor(U[None])[0]
         P = inverse_U @ inverse_U.T
-        freedom = _satterthwaite(P, J[:, :n], L[:, n:])
+        freedom = satterthwaite(P[:n, :n], P[n:, n:], J[:, :n], L[:, n:])
     freedom = np.concatenate([freedom, np.full(k, np.inf)])
     return Estimated(joint, x, converged, P, freedom, deviance)
 
 
-def _satterthwaite(P: Array, J: Array, by_theta: Array) -> Array:
-    """Computes the degrees of freedom (n,) behind variances v: 2 v^2 / var(v), which is 2 / var(log
-    v).
+def satterthwaite(P: Array, of_levels: Array, J: Array, by_theta: Array) -> Array:
+    """Computes the degrees of freedom (..., n) behind the variances v in P (..., n, n): 2 v^2 /
+    var(v), which is 2 / var(log v).
 
     The logarithm of a variance changes with the logarithms of levels by `change`, and those have a
-    covariance.
+    covariance (..., k, k).
     """
-    n = J.shape[1]
-    inner = P[:n, :n]
-    change = 2 * ((J @ inner) ** 2).T @ by_theta / np.diag(inner)[:, None]
-    return 2.0 / np.einsum("ik,kl,il->i", change, P[n:, n:], change)
+    squares = ((J @ P) ** 2).swapaxes(-1, -2)
+    change = 2 * squares @ by_theta / deviations(P)[..., None] ** 2
+    return 2.0 / deviations(change @ of_levels @ change.swapaxes(-1, -2)) ** 2
 
 
 def _require_residuals(levels: Levels, z: Array, r: Array, J: Array) -> None:

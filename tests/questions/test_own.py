@@ -23,6 +23,7 @@ from ipe_bench.questions.own.answer import (
     taken,
     takes_one,
 )
+from ipe_bench.questions.own.levels import by_levels
 from ipe_bench.questions.own.maths import Claim, Own, Point, _claims, _Truth, own
 from ipe_bench.questions.own.tracks import own_log
 from ipe_bench.real.estimation import Question
@@ -58,6 +59,31 @@ def test_intervals_of_a_line_hold_the_truth_in_95_percent(noise: Any) -> None:
         assert one.factor == pytest.approx(1.0, abs=0.12)
     slope = np.polyfit(T[:6], line().found.z, 1)
     np.testing.assert_allclose([point.at["a"], point.at["b"]], slope, rtol=1e-6)
+
+
+def test_intervals_with_a_level_by_group_are_those_that_an_estimate_reports() -> None:
+    """Of each simulated data set, estimated anew by itself."""
+    t = np.arange(20.0)
+    model = ib.measurements.Formula(
+        "a*t + b + 0*g", {"a": 1.0, "b": 1.0}, columns={"t": t.tolist(), "g": [1, 2] * 10}
+    )
+    rng = np.random.default_rng(3)
+    sigma = np.array([5.0, 0.1] * 10)
+    z = 3.0 + 0.5 * t + sigma * rng.standard_normal(20)
+    noise = ib.noise.Unknown(by="g")
+    lm = {"lm": ib.baselines.LevenbergMarquardt()}
+    (found,) = ib.estimate(model, z, lm, noise=noise, examine=False)
+    problem = replace(found.given.problem, R=found.assumed.R)
+    x = found.inner[:2]
+    draws = model.simulate(x[None]) + sigma * rng.standard_normal((5, 20))
+    known = lm["lm"].estimate(problem, draws)
+    reported = by_levels(found.estimated, problem, x, draws - model.simulate(known.x))
+    for k, one in enumerate(draws):
+        (alone,) = ib.estimate(model, one, lm, noise=noise, examine=False)
+        low, high = np.array(alone.interval())[:, :2]
+        half = np.sqrt(np.diag(known.covariance[k])) * reported.width[k]
+        np.testing.assert_allclose(known.x[k] + reported.shift[k], (low + high) / 2, rtol=1e-4)
+        np.testing.assert_allclose(half, (high - low) / 2, rtol=1e-3)
 
 
 def test_a_prior_is_told_to_filters_and_is_no_part_of_the_truth() -> None:

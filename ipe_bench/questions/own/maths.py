@@ -22,6 +22,7 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount, cost
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.questions.own.levels import Reported, by_levels
 from ipe_bench.real.estimation import Question
 from ipe_bench.real.examination import Examination
 from ipe_bench.real.fits import Fit, scaled
@@ -201,6 +202,8 @@ def own(
         points.append(Point(dict(zip(names, values, strict=True)), claims))
     more = len(truths) - len(points)
     noise = from_to(problem.R.deviations.tolist(), "{:.3g}".format)
+    if len(fit.levels) > 1:
+        noise = ", ".join(f"{name} = {value:.3g}" for name, value in fit.levels.items())
     return Own(trials, points, noise, question.has_prior, left_out, further=more)
 
 
@@ -273,22 +276,28 @@ def _claims(
     curves.append(_curves(model, _from_truth(problem, truth.x, z), z))
     sums = np.stack([_squares(problem, z - h) for h in curves])
     best = np.stack(curves)[sums.argmin(axis=0), np.arange(len(z))]
-    free = fit.degrees_of_freedom
     claims = []
     for (label, told, each), h, chi_square in zip(runs, curves, sums, strict=False):
         # Its curve lies closer to the best fit's than noise puts that to the truth's.
         near = _squares(problem, model.near(h, best) - best) <= model.n
-        scale = np.ones(len(z))
-        freedom = None
-        if fit.given.noise.estimated:
-            # As `estimate` reports it, which does not know the level.
-            scale = np.sqrt(chi_square / free)
-            # An answer that has no readings has no interval, not an infinite one.
-            scale = np.where(np.isfinite(scale), scale, 0.0)
-            freedom = free
-        width = half_width(CONFIDENCE, freedom) * scale
-        claims.append(_claim(label, told, model, each, truth, near, np.asarray(width)))
+        reported = _reported(fit, problem, truth.x, z - h, chi_square)
+        claims.append(_claim(label, told, model, each, truth, near, reported))
     return claims
+
+
+def _reported(fit: Fit, problem: Problem, x: Array, r: Array, chi_square: Array) -> Reported:
+    """Finds what `estimate`, which does not know the noise, makes of answers with residuals r
+    (trials, m) to readings at the truth x (n,)."""
+    still = np.zeros((len(r), problem.measurement.n))
+    if fit.estimated is not None:
+        return by_levels(fit.estimated, problem, x, r)
+    if not fit.given.noise.estimated:
+        return Reported(still, still + half_width(CONFIDENCE, None))
+    free = fit.degrees_of_freedom
+    scale = np.sqrt(chi_square / free)
+    # An answer that has no readings has no interval, not an infinite one.
+    scale = np.where(np.isfinite(scale), scale, 0.0)
+    return Reported(still, half_width(CONFIDENCE, free) * (still + scale[:, None]))
 
 
 def _tellings(problem: Problem, estimator: Estimator) -> dict[str, Problem]:
@@ -342,19 +351,20 @@ def _claim(
     each: Estimates,
     truth: _Truth,
     near: Array,
-    width: Array,
+    reported: Reported,
 ) -> Claim:
-    """Counts what an estimator found, given the half-widths (trials,) of its intervals in standard
-    errors."""
+    """Counts what an estimator found, given what `estimate` would report of its answers."""
     deviation = np.full(each.x.shape, np.nan)
     with np.errstate(all="ignore"):
         if each.covariance is not None:
             deviation = deviations(each.covariance)
-        ratios = np.stack([np.abs(each.x - x) / (deviation * width[:, None]) for x in truth.copies])
+        half = deviation * reported.width
+        answer = each.x + reported.shift
+        ratios = np.stack([np.abs(answer - x) / half for x in truth.copies])
     ratios = np.where(np.isfinite(ratios), ratios, np.inf)
     # An answer at a copy, such as one of another sign, is held against that.
     closest = ratios.max(axis=2).argmin(axis=0)
-    ratio = ratios[closest, np.arange(len(width))]
+    ratio = ratios[closest, np.arange(len(half))]
     names = [p.name for p in model.physical_parameters]
     spent = np.median(cost(each.simulations, each.jacobians, model.jacobian_cost))
     seconds = float(np.mean(each.seconds))
