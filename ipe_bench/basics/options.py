@@ -57,6 +57,8 @@ _BOUNDED = {
     (Ge, Le): "{} from {} to {}",
     (MinLen,): "{} of at least {}",
 }
+_WITH_UNIT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+) ?(?P<unit>[^\W\d_]{1,3}|%)")
+"""A number with its unit."""
 _NOUNS = {
     int: "a whole number",
     float: "a number",
@@ -238,7 +240,9 @@ def checked(value: Any, hint: Any, key: str) -> Any:
 def _refusal(value: Any, wanted: str, key: str) -> UserError:
     shown = list(value) if isinstance(value, tuple) else value
     text = " ".join(str(shown).split())
-    return UserError(f"{key}={shortened(text, 60)}: give {wanted}")
+    measured = _WITH_UNIT.fullmatch(text)
+    first = f"leave {measured['unit']} out, and " if measured else ""
+    return UserError(f"{key}={shortened(text, 60)}: {first}give {wanted}")
 
 
 def _constrained(value: Any, kind: Any, metadata: Sequence[Any], key: str) -> Any:

@@ -33,7 +33,7 @@ _LONGEST = 50_000
 _FEWEST = 20
 """Fewest of either that say anything of shares."""
 _REFUSED = "has no meaning with a model and readings of your own"
-_WITHOUT_MEANING = (*of("run", "figures"), TRUTH, "find", "gate", "experiment")
+_WITHOUT_MEANING = (*of("run"), TRUTH, "find", "gate", "experiment")
 
 
 def own_command(short: Short) -> int:
@@ -45,6 +45,9 @@ def own_command(short: Short) -> int:
     choice = [f"{group}=[{','.join(names)}]" for group, names in standard.OF_OWN.items()]
     asked = single("run", short.words, choice)
     asked.words.refuse(_WITHOUT_MEANING, _REFUSED)
+    if asked.spec.figures != "none":
+        # None are drawn: so only who wants some is told.
+        asked.words.refuse(of("figures"), _REFUSED)
     trials = asked.spec.trials
     if trials is not None and trials < _FEWEST:
         raise UserError(f"trials={trials}: are too few to estimate shares; give at least {_FEWEST}")
@@ -86,7 +89,7 @@ def _of_constants(asked: Single, files: list[str]) -> tuple[Own, AbstractContext
         prior=question.has_prior,
         estimators=asked.estimators,
     )
-    return own(question, spec.estimators, trials, spec.seed), folder
+    return own(question, spec.estimators, trials, spec.seed, "lines"), folder
 
 
 def _of_log(asked: Single, files: list[str]) -> tuple[Own, AbstractContextManager[Path]]:
@@ -110,4 +113,4 @@ def _of_log(asked: Single, files: list[str]) -> tuple[Own, AbstractContextManage
         model=describe(log.model),
         trackers=asked.estimators,
     )
-    return own_log(log, spec.estimators, trials, spec.seed), folder
+    return own_log(log, spec.estimators, trials, spec.seed, "lines"), folder

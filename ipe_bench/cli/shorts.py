@@ -474,6 +474,9 @@ class _Reader:
             words += [f"measurement.outputs=[{','.join(map(w.quoted, outputs))}]", *levels]
             readings = f"Readings: columns {enumerate_few(outputs)} of {', '.join(self.files)}"
             readings += f", in the order in which {chosen.name} returns them."
+            if "output" in self.columns:
+                readings = f"Readings: column reading of {', '.join(self.files)}; column output"
+                readings += f" tells {enumerate_few(outputs)} apart."
             return self._short(words, [model, readings, self._noise_line(levels)])
         columns = signature.columns
         reading = self._reading_column(signature.text, columns, ["reading"])
@@ -525,6 +528,8 @@ class _Reader:
         if not tuples:
             return []
         arrays = tuples[-1].elts
+        if "output" in self.columns and "reading" in self.columns:
+            return self._outputs_below(_names_of(tuples[-1]), what)
         free = [name for name in self._columns_left(taken) if not name.startswith(f"{SIGMA}_")]
         alike = [_names_of(one) for one in tuples if len(one.elts) == len(arrays)]
         meanings = [{*names} & {*free} for names in zip(*alike, strict=True)]
@@ -544,6 +549,19 @@ class _Reader:
             f"{self.files[0]}: {what} returns {len(arrays)} arrays, and columns"
             f" {enumerate_few(free) or 'none'} are left for them; name theirs in order:"
             f" {self._again(f'measurement.outputs=[{example}]')}"
+        )
+
+    def _outputs_below(self, named: Sequence[str], what: str) -> list[str]:
+        """Finds the names of outputs whose readings stand below each other."""
+        (table,) = read_tables([Path(self.files[0])])
+        there = list(dict.fromkeys(text.strip() for text, _ in table.column("output")))
+        if sorted(named) == sorted(there):
+            return list(named)
+        word = f"measurement.outputs=[{','.join(there)}]"
+        raise UserError(
+            f"{self.files[0]}: {what} returns {len(named)} arrays, and the column output names"
+            f" {enumerate_few(there)}; name them in the order of the arrays:"
+            f" {self._again(word)}"
         )
 
     @property

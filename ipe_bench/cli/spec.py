@@ -81,6 +81,11 @@ class Spec(Component):
 
     def __post_init__(self) -> None:
         which_figures(self.figures)
+        if isinstance(self.gate, int | float) and 1 < self.gate <= 100:
+            raise UserError(
+                f"gate={self.gate:g}: is the share of good readings that pass, at most 1; write"
+                f" gate={self.gate / 100:.6g} for {self.gate:g} %"
+            )
         super().__post_init__()
         object.__setattr__(self, "formats", file_formats(self.formats))
         for key in ("name", "output"):

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 Need = Literal["differential equations", "epochs", "prior"]
 Family = Literal["IPE", "filters", "least squares", "ensembles"]
 Equation = Literal["frozen", "least_squares", "map"]
+_NEEDED = {"epochs": "an order of the readings in time"}
+"""Needs in the words of a message, where these are others."""
 _ENDED = [status.value for status in Status if status != Status.RUNNING]
 _MOST = 1e15
 """More iterations than any clock allows, and fewer than where floats skip whole numbers."""
@@ -155,7 +157,9 @@ class Estimator(Component, ABC):
             "epochs": problem.measurement.epochs is not None,
             "prior": problem.prior_deviation is not None,
         }
-        lacking = " and ".join(need for need in sorted(self.needs) if not has[need])
+        lacking = " and ".join(
+            _NEEDED.get(need, need) for need in sorted(self.needs) if not has[need]
+        )
         if not lacking:
             return None
         return f"needs {lacking}, which measurement={problem.measurement.name} does not have"

@@ -306,13 +306,16 @@ class Function(WrittenModel):
             )
         of_jax = any(type(values).__module__.startswith("jax") for values in found)
         numpy = sys.modules["jax"].numpy if of_jax else np
-        places = self._places
-        rows = int(places.max()) + 1
-        arrays = [numpy.asarray(self._checked(values, rows))[places] for values in found]
-        z = arrays[0]
-        for name, values in zip(self.outputs, arrays, strict=True):
-            z = numpy.where(np.array(self.output) == name, values, z)
-        return z
+        rows, among_all = self._taken
+        return numpy.concatenate([self._checked(values, rows) for values in found])[among_all]
+
+    @cached_property
+    def _taken(self) -> tuple[int, NDArray[np.intp]]:
+        """The number of rows of each array, and the place (m,) of each reading in all arrays, one
+        behind the other."""
+        rows = int(self._places.max()) + 1
+        outputs = np.array([self.outputs.index(name) for name in self.output])
+        return rows, outputs * rows + self._places
 
     def _checked(self, z: Any, m: int | None) -> Any:
         if np.ndim(z) != 1 or m not in (None, len(z)):

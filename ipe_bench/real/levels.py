@@ -367,6 +367,12 @@ def _require_residuals(levels: Levels, z: Array, r: Array, J: Array) -> None:
     size = np.linalg.norm(J, axis=0)
     scaled = J / divisors(size)
     known = np.isfinite(J).all()
+    if len(r) < J.shape[1] + len(levels.parameters):
+        names = ", ".join(p.name for p in levels.parameters)
+        raise UserError(
+            f"noise=unknown: {len(r)} readings are too few for {J.shape[1]} parameters and the"
+            f" noise {names}; state the noise, as in noise.deviation=0.1, or add readings"
+        )
     for k, name in enumerate(levels.groups):
         rows = np.flatnonzero(levels.group == k)
         told = f"of {name} " if name else ""

@@ -680,7 +680,7 @@ def test_filters_that_nobody_chose_are_left_out_where_the_model_has_no_use_for_t
     assert set(ib.load("out")["estimator"]) == {"fixed_point", "linear_lse"}
     code, _, error = ipe_bench(*words, "baseline=[ekf]")
     assert code == 2
-    assert "estimators.ekf: needs epochs" in error
+    assert "estimators.ekf: needs an order of the readings in time" in error
 
 
 CASES = {

@@ -41,6 +41,8 @@ FILES = {
     "many.py": "def law(t, k=1.0):\n    y = k * t\n    return k + t, y\n",
     "crossed.py": "def law(t, k=1.0):\n    y, left = k * t, k + t\n    return y, left\n",
     "named.py": "def law(t, k=1.0):\n    x, y = k + t, k * t\n    return y, x\n",
+    "long.csv": "t,output,reading\n1,y,1.6\n1,x,1.1\n2,y,1.3\n2,x,1.2\n",
+    "longer.csv": "t,output,reading\n1,y,1.6\n1,far,1.1\n2,y,1.3\n2,far,1.2\n",
     "branched.py": "def law(t, k=1.0):\n    def half(t):\n        return t, t, t\n\n"
     "    x, y = k + t, k * t\n    if k > 9:\n        return t, t\n    else:\n        return y, x\n",
     "swapped.py": "def law(t, k=1.0):\n    x, y = k + t, k * t\n"
@@ -93,6 +95,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: str) -> None:
     assert said in shorts.read("estimate", words).assumed[0]
+
+
+def test_outputs_below_each_other_are_named_by_the_function() -> None:
+    read = shorts.read("estimate", ["named.py", "long.csv"])
+    assert "measurement.outputs=['y','x']" in read.words
+    assert "column output tells y, x apart" in read.assumed[1]
 
 
 @pytest.mark.parametrize(
@@ -263,6 +271,10 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
             "measurement.start.t: makes t a parameter",
         ),
         (["falling.py", "falling.csv", "measurement.start.t=3"], "and falling.csv has a column t"),
+        (
+            ["named.py", "longer.csv"],
+            "names y, far; name them in the order of the arrays: ipe-bench",
+        ),
         (["gins", "line.csv"], "gins: is not KEY=VALUE; write measurement=gins"),
         (["t+y", "line.csv"], "no column is left for the readings"),
         (["many.py", "three.csv"], "returns 2 arrays, and columns x, y, z are left for them; name"),

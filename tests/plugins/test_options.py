@@ -81,6 +81,13 @@ def test_a_type_accepts_what_it_means_and_says_what_it_wants(hint, good, bad, re
             checked(value, hint, "key")
 
 
+@pytest.mark.parametrize(("text", "unit"), [("5mm", "mm"), ("99.9 %", "%"), ("-.5°", "")])
+def test_a_number_with_its_unit_is_told_to_come_without(text, unit):
+    said = f"^key={text}: leave {unit} out, and give a" if unit else "°: give a number"
+    with pytest.raises(UserError, match=said):
+        checked(text, Positive, "key")
+
+
 def test_a_choice_is_one_of_its_own_type():
     assert checked(2, Literal[1, 2], "start") == 2
     for value in (3, "1", True, 1.0):

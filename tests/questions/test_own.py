@@ -254,7 +254,7 @@ def test_long_logs_have_fewer_simulated_ones_and_none_beyond_a_limit(
 ) -> None:
     told: list[int] = []
 
-    def simulated(log: Log, trackers: Any, trials: int, seed: int) -> Own:
+    def simulated(log: Log, trackers: Any, trials: int, *others: Any) -> Own:
         told.append(trials)
         raise UserError("enough")
 
@@ -309,9 +309,10 @@ def true_shares(model: ib.Measurement, x: Any, s: float, number: int) -> dict[st
     h = model.simulate(truth[None])[0]
     problem = ib.Scenario(model, ib.noise.Gaussian(s)).problem.without_prior()
     given = SimpleNamespace(noise=ib.noise.Unknown())
-    fit: Any = SimpleNamespace(given=given, degrees_of_freedom=len(h) - model.n)
+    free = len(h) - model.n
+    fit: Any = SimpleNamespace(given=given, degrees_of_freedom=free, estimated=None)
     z = h + s * np.random.default_rng(1).standard_normal((number, len(h)))
-    claims = _claims(fit, problem, LEAST_SQUARES, _Truth(truth, (truth,)), z, str)
+    claims = _claims(fit, problem, LEAST_SQUARES, _Truth(truth, (truth,)), z, lambda _: str)
     return {one.label: one for one in claims}
 
 

@@ -283,6 +283,7 @@ def test_two_probable_states_are_no_reason_to_leave_a_reading_out():
         ),
         (["tracker=[ekf]", "gate=0.99", "find=[w]"], "find: the likelihood of trackers.ekf jumps"),
         (["tracker=[ekf]", "gate=0"], "gate=0.0: give a number above 0 and up to 1"),
+        (["tracker=[ekf]", "gate=99.9"], "at most 1; write gate=0.999 for 99.9 %"),
     ],
 )
 def test_what_takes_no_gate_says_so(ipe_bench, tmp_path, words, complaint):

@@ -8,7 +8,7 @@ estimators start where the user does. The prior of an estimator is no part of th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +27,7 @@ from ipe_bench.real.estimation import Question
 from ipe_bench.real.examination import Examination
 from ipe_bench.real.fits import Fit, scaled
 from ipe_bench.real.profiles import CONFIDENCE, half_width
+from ipe_bench.report.progress import Shows, counting
 from ipe_bench.report.words import from_to
 from ipe_bench.statistics.intervals import clopper_pearson
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -37,6 +38,8 @@ SIZES = (1.0, 10.0)
 """Deviations of the prior in sizes of the start, where a user states none."""
 _SAME_CURVE = 1e-3
 """Answers whose readings differ by less than this, in standard deviations, are of one curve."""
+_AT_ONCE = 25
+"""Data sets between two words on progress."""
 _NOISE = 1
 """The random stream of a trial's noise, as in `ipe_bench.trials.scenario`."""
 
@@ -172,14 +175,16 @@ def own(
     estimators: Mapping[str, Estimator],
     trials: int,
     seed: int = 0,
+    progress: Shows = False,
 ) -> Own:
     """Simulates readings like those of a question, which names one estimator that answers it, and
-    lets `estimators` answer them.
+    lets `estimators` answer them; `progress` shows how far that is.
 
     Raises:
         UserError: the question has no answer from which readings can be simulated.
     """
-    fits, examination = question.fitted()
+    with counting("estimate", 1, progress) as begin:
+        fits, examination = question.fitted(begin)
     fit = fits[0]
     require_answer(fit)
     problem = _at_least(fit, examination)
@@ -194,12 +199,14 @@ def own(
     kept = {label: one for label, one in estimators.items() if label not in left_out}
     points = []
     truths = _truths(fit, examination, problem)
-    for truth in truths[:MOST_POINTS]:
-        z = _drawn(fit, problem, truth.x, trials, seed)
-        claims = _claims(fit, problem, kept, truth, z)
-        values = problem.measurement.physical(truth.x[None])[0].tolist()
-        names = [p.name for p in problem.measurement.physical_parameters]
-        points.append(Point(dict(zip(names, values, strict=True)), claims))
+    simulated = truths[:MOST_POINTS]
+    with counting("simulated data sets", len(simulated) * len(kept), progress) as begin:
+        for truth in simulated:
+            z = _drawn(fit, problem, truth.x, trials, seed)
+            claims = _claims(fit, problem, kept, truth, z, begin)
+            values = problem.measurement.physical(truth.x[None])[0].tolist()
+            names = [p.name for p in problem.measurement.physical_parameters]
+            points.append(Point(dict(zip(names, values, strict=True)), claims))
     more = len(truths) - len(points)
     noise = from_to(problem.R.deviations.tolist(), "{:.3g}".format)
     if len(fit.levels) > 1:
@@ -264,13 +271,20 @@ def _claims(
     estimators: Mapping[str, Estimator],
     truth: _Truth,
     z: Array,
+    begin: Callable[[str], Callable[[str], object]],
 ) -> list[Claim]:
     """Lets each estimator answer readings z (trials, m) of a truth, those with a prior once for
-    each that they are told."""
+    each that they are told; `begin` is called with the label of each, and what it returns with how
+    far that is."""
     runs: list[tuple[str, str, Estimates]] = []
     for label, one in estimators.items():
+        tell = begin(label)
         for told, known in _tellings(problem, one).items():
-            runs.append((label, told, estimate_safely(one, known, z)))
+            parts = []
+            for first in range(0, len(z), _AT_ONCE):
+                tell(f"{first} of {len(z)}")
+                parts.append(estimate_safely(one, known, z[first : first + _AT_ONCE]))
+            runs.append((label, told, Estimates.join(parts)))
     model = problem.measurement
     curves = [_curves(model, each.x, z) for _, _, each in runs]
     curves.append(_curves(model, _from_truth(problem, truth.x, z), z))

@@ -13,6 +13,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.questions.own.maths import Claim, Own, Point
 from ipe_bench.real.logs import Log, LogTracks
 from ipe_bench.real.profiles import CONFIDENCE, half_width
+from ipe_bench.report.progress import Shows, counting
 from ipe_bench.states.auto import AutoTracker
 from ipe_bench.states.base import Paths, beginning_at
 from ipe_bench.states.trackers import Tracker
@@ -25,9 +26,10 @@ def own_log(
     trackers: Mapping[str, Tracker],
     trials: int,
     seed: int = 0,
+    progress: Shows = False,
 ) -> Own:
     """Simulates logs that begin where this one does, by its smoothed start, and lets `trackers`
-    follow them with the model's prior.
+    follow them with the model's prior; `progress` shows how far that is.
 
     Raises:
         UserError: the log has no track from which logs can be simulated.
@@ -48,16 +50,18 @@ def own_log(
     drawn = scenario.draw(0, trials)
     from_prior = PathBlock(scenario, 0, _missing_as_in(log, drawn))
     claims = []
-    for label, tracker in trackers.items():
-        estimates, kept = from_start.estimate(tracker)
-        _, over_prior = from_prior.estimate(tracker)
-        names = from_start.names
-        ratio = _ratios(over_prior, names) / half_width(CONFIDENCE, None)
-        spent = float(np.median(estimates.simulations))
-        seconds = float(np.mean(estimates.seconds))
-        claims.append(
-            Claim.of(label, "", kept["success"], ratio, names, cost=spent, seconds=seconds)
-        )
+    with counting("simulated logs", len(trackers), progress) as begin:
+        for label, tracker in trackers.items():
+            begin(label)
+            estimates, kept = from_start.estimate(tracker)
+            _, over_prior = from_prior.estimate(tracker)
+            names = from_start.names
+            ratio = _ratios(over_prior, names) / half_width(CONFIDENCE, None)
+            spent = float(np.median(estimates.simulations))
+            seconds = float(np.mean(estimates.seconds))
+            claims.append(
+                Claim.of(label, "", kept["success"], ratio, names, cost=spent, seconds=seconds)
+            )
     values = {}
     for state, value in zip(log.model.states, start, strict=True):
         values[state.name] = float(value * state.size)
