@@ -41,6 +41,18 @@ def _handlers_of_this_test():
         logging.root.removeHandler(handler)
 
 
+@pytest.fixture(autouse=True)
+def _modules_of_this_test(request):
+    """Forgets the modules that a test has loaded from its folder: another has its own of the same
+    name."""
+    before = set(sys.modules)
+    yield
+    folder = request.node.funcargs.get("tmp_path")
+    for name in set(sys.modules) - before:
+        if folder and str(getattr(sys.modules[name], "__file__", None)).startswith(str(folder)):
+            del sys.modules[name]
+
+
 @pytest.fixture
 def ipe_bench(monkeypatch, capsys, tmp_path):
     """Runs a command in an empty folder, whose modules and plugins are forgotten afterwards: its
@@ -60,9 +72,6 @@ def ipe_bench(monkeypatch, capsys, tmp_path):
 
     yield run
     discovery.sources.cache_clear()
-    for name, module in list(sys.modules.items()):
-        if str(getattr(module, "__file__", None)).startswith(str(tmp_path)):
-            del sys.modules[name]
 
 
 @pytest.fixture

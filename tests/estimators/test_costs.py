@@ -107,9 +107,15 @@ TRACKED += [(name, "growth", False) for name in TRACKERS]
 
 
 def dear(name: str, model: str, moved_first: bool) -> bool:
-    """Whether the same tracker is counted on a model that takes less, or in the other order."""
-    of_two_sides = name.startswith("grid") and not moved_first
-    return of_two_sides or (model == "coordinated_turn" and name in ("ghkf", "iplf", "ipls"))
+    """Whether the same tracker is counted on a model that takes less, or in the other order: each
+    is counted at once on growth, and on one of the others by turns, which is never the dearest for
+    trackers of many points."""
+    if model == "growth":
+        return name.startswith("grid") and not moved_first
+    others = ["exact", "constant_velocity"]
+    if name not in ("ghkf", "iplf", "ipls"):
+        others.append("coordinated_turn")
+    return model != others[[*TRACKERS].index(name) % len(others)]
 
 
 def watched(model: StateModel, seen: Counter[str], first: bool) -> StateModel:

@@ -179,7 +179,7 @@ def test_an_estimate_is_right_in_a_branch_that_the_start_is_not_in(laws, name):
     import some_laws
 
     law = getattr(some_laws, name)
-    fit = {fit.label: fit for fit in ib.estimate(function(law), "bell.csv")}["auto"]
+    (fit,) = ib.estimate(function(law), "bell.csv", {"auto": ib.solvers.Auto()})
     expected, covariance = curve_fit(
         some_laws.bell, T, z, p0=[3.0, 1.5, 0.5, 0.3], xtol=1e-12, ftol=1e-12
     )
