@@ -110,6 +110,7 @@ def test_the_examples_in_the_docstrings_come_out_as_they_say(place):
     assert counts.attempted > 0 or not needed, f"{place} has no example"
 
 
+@pytest.mark.slow
 def test_the_python_of_the_readme_runs_as_it_stands(tmp_path, monkeypatch):
     readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)

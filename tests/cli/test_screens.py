@@ -197,6 +197,7 @@ def test_headings_name_models_and_what_differs_beside_their_names():
     ]
 
 
+@pytest.mark.slow
 def test_the_table_of_a_sweep_shows_the_largest_scale_at_which_half_may_hold(tmp_path, capsys):
     """At the least scale, where all are alike, nothing is told."""
     store, rng = Synthetic(tmp_path / "half"), np.random.default_rng(0)

@@ -127,7 +127,8 @@ STEEP += [1.280988851538506, 1.4403870545862594, 1.439644250890874, 1.2800138633
 STEEP += [0.9349706185969648, 0.7035165962457238, 0.914155421686925]
 
 
-@pytest.mark.parametrize("mirrored", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mirrored", [False, True])
 def test_parameters_that_run_off_together_have_no_standard_error(mirrored):
     """A step between two readings: its height is the mean of those behind the one on it."""
     t = np.arange(27.0)

@@ -166,7 +166,13 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.source)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(one, id=one.source, marks=[pytest.mark.slow] * ("15 kHz" in one.source))
+        for one in CASES
+    ],
+)
 def test_the_answer_to_a_public_problem_is_the_right_one(case: Case) -> None:
     start = {**dict.fromkeys(case.right, 1.0), **case.start}
     columns = {name: np.asarray(column, float).tolist() for name, column in case.columns.items()}

@@ -409,6 +409,7 @@ def test_certified_readings_of_no_collection_are_found_too_and_an_empty_folder_i
     assert tables["all_trials"].data["capped_error"].tolist() == [0.0]
 
 
+@pytest.mark.slow
 def test_states_that_move_have_words_of_their_own(tmp_path):
     """A smoother and its filter have the same readings at the last epoch; over all epochs it has
     later ones too."""

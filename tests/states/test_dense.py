@@ -145,7 +145,7 @@ def beside_dense(model, names):
             yield name, np.abs((tracks.covariance[trial] - P) / of_both).max()
 
 
-@pytest.mark.parametrize("model", CASES[::40], ids=repr)
+@pytest.mark.parametrize("model", CASES[::80], ids=repr)
 def test_trackers_of_each_kind_are_exact_for_a_linear_model(model):
     for name, error in beside_dense(model, ("ekf", "ukf_rts", "auto")):
         assert error < 1e-8, name

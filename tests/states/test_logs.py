@@ -73,6 +73,7 @@ def test_a_track_is_continued_from_its_covariance():
     )
 
 
+@pytest.mark.slow
 def test_a_log_is_tracked_with_the_bits_of_a_run(tmp_path):
     model = CoordinatedTurn(count=25)
     trackers = {"ekf": ekf(), "ukf": ukf(), "rts": Smoother(ckf()), "particles": Bootstrap(100)}

@@ -47,6 +47,7 @@ def test_the_second_path_is_the_mirror_image_and_as_probable():
     np.testing.assert_allclose(found.other[away], MIRROR * found.mean[away], atol=0.02)
 
 
+@pytest.mark.slow
 def test_the_mirror_image_of_a_heading_is_its_negative():
     """A robot drives with unit speed past two beacons on the line y = 0: its image drives on the
     other side of it, with the heading of opposite sign."""
@@ -94,6 +95,7 @@ ASYMMETRIC = Formulas(
 """A nearly constant state, read four times by a function with a wide slope and a steep one."""
 
 
+@pytest.mark.slow
 def test_the_probability_of_a_second_path_of_another_width_is_that_of_the_exact_posterior():
     paths = ASYMMETRIC.draw(0, 400)
     found = AutoTracker().track(ASYMMETRIC, paths.z)
@@ -155,6 +157,7 @@ def test_a_log_says_that_a_second_path_is_the_likelier_one():
     assert note.startswith(said)
 
 
+@pytest.mark.slow
 def test_a_trial_that_a_mirror_image_leaves_open_is_ambiguous():
     block = PathBlock.draw(StateScenario(BEACONS), 0, 20)
     columns = block.estimate(AutoTracker())[1]

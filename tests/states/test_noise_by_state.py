@@ -437,7 +437,7 @@ TURNING = Formulas(
 @pytest.mark.parametrize(
     "label",
     slow_if(
-        lambda label: label in ("iplf", "ieks", "ipls", "lm_ieks"),
+        lambda label: label in ("iplf", "ukf_rts", "ieks", "ipls", "lm_ieks"),
         ["ekf", "iplf", "ukf_rts", "ieks", "ipls", "lm_ieks", "ipe_newton", "bootstrap"],
     ),
 )

@@ -170,7 +170,7 @@ def inverse(A):
     "means and covariances of 16 singular cases by 14 trackers",
     1e-8,
 )
-@pytest.mark.parametrize("case", slow_if(lambda case: [*CASES].index(case) % 4, CASES))
+@pytest.mark.parametrize("case", slow_if(lambda case: [*CASES].index(case) % 8, CASES))
 def test_singular_cases_have_their_exact_conditional_means(case):
     model = CASES[case]
     z = np.round(model.draw(0, 1).z * 64) / 64

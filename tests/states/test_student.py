@@ -145,6 +145,7 @@ def own_densities(z):
     return described(filtered), described(smoothed[::-1])
 
 
+@pytest.mark.slow
 def test_trackers_have_nearly_the_moments_of_the_exact_density():
     """Those of a grid are exact; a filter takes what is predicted as normal, a path its mode."""
     z = LEVEL.draw(0, 4, 1).z

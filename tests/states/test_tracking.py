@@ -77,6 +77,7 @@ def test_a_run_says_what_direct_computation_says(tmp_path):
     assert np.isnan(row(table, "rts")["path_nis"])
 
 
+@pytest.mark.slow
 def test_a_sweep_of_states_opens_with_who_holds(tmp_path):
     for scale in (1.0, 10.0):
         ib.run(
@@ -105,6 +106,7 @@ def test_sums_that_another_version_stored_are_left_out():
     assert unpacked(texts, 4, 2).shape == (0, 4, 2)
 
 
+@pytest.mark.slow
 def test_the_mean_nis_of_several_readings_an_epoch_is_that_of_one():
     model, scenario = CoordinatedTurn(), StateScenario(CoordinatedTurn(), seed=3)
     z = model.draw(0, 20, 3).z
@@ -138,6 +140,7 @@ def test_the_kalman_filter_attains_both_bounds_on_its_own_model():
         )
 
 
+@pytest.mark.slow
 def test_an_error_scale_widens_the_prior_of_truth_and_trackers(tmp_path):
     trackers = {"ckf": ckf(), "rts": Smoother(ekf())}
     for scale, name in ((1.0, "one"), (3.0, "three")):
