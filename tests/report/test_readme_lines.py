@@ -16,10 +16,11 @@ import pytest
 from gallery_frames import SUFFIX, read
 from make_docs import STORED
 from PIL import Image
-from readme import BEGINS, ENDS, PICTURES, block
+from readme import BEGINS, ENDS, PICTURES, block, save, view_of
 from scipy.stats import chi2
 
 import ipe_bench as ib
+from ipe_bench.report.style import house_style
 from ipe_bench.statistics.analysis import analyse
 
 ROOT = Path(__file__).parents[2]
@@ -169,23 +170,63 @@ def check(folder: Path) -> pd.DataFrame:
     return found
 
 
-@pytest.mark.slow
-def test_every_line_runs_in_order_and_the_table_comes_out(tmp_path):
-    (command,) = re.findall(
-        r"^run:.*\n\t\$\(BIN\)/(.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
-    )
-    script = "\n".join(LINES).replace("make run\nmake test\n. .venv/bin/activate\n", f"{command}\n")
-    assert script.count("ipe-bench ") >= 9
-    assert ".assets/headline.png" in README
+def typed(folder: Path, script: str) -> None:
+    """Runs lines as a reader types them."""
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     done = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", script],
-        cwd=tmp_path,
+        cwd=folder,
         env=environment,
         capture_output=True,
         text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def made_by_run() -> str:
+    """The command of `make run`."""
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (command,) = re.findall(r"^run:.*\n\t\$\(BIN\)/(.*)$", makefile, re.MULTILINE)
+    return command
+
+
+FEW = 20
+"""Trials of each command where all lines run in their order."""
+
+
+@pytest.mark.slow
+def test_every_line_runs_in_order(tmp_path):
+    """The figure's run has the first of the trials that are stored of it."""
+    lines = "\n".join(LINES)
+    script = lines.replace("make run\nmake test\n. .venv/bin/activate\n", f"{made_by_run()}\n")
+    assert script.count("ipe-bench ") >= 9
+    without = re.sub(r" trials=\d+", "", script)
+    typed(tmp_path, re.sub(r"(?m)^ipe-bench run .*$", rf"\g<0> trials={FEW}", without))
+    found = check(tmp_path / "outputs/headline")["success"]
+    stored = read(STORED / f"headline{SUFFIX}").analysis.summary
+    whole = stored[stored["parameter"] == "all"].set_index(["error_scale", "estimator"])
+    assert len(found) == len(whole) == 7 * 12
+    for cell, share in found.items():
+        kept = round(whole["success"][cell] * whole["trials"][cell])
+        others = whole["trials"][cell] - FEW
+        assert kept - others <= round(share * FEW) <= kept, cell
+
+
+@pytest.mark.slow
+def test_its_picture_is_drawn_from_the_stored_experiment(tmp_path):
+    """If it is not, `make gallery` draws it again."""
+    assert ".assets/headline.png" in README
+    drawn = tmp_path / "drawn.png"
+    analysis = read(STORED / f"headline{SUFFIX}").analysis
+    with house_style():
+        save(view_of(analysis), drawn)
+    assert off_by(PICTURES[0], drawn) < 2e-5
+
+
+@pytest.mark.campaign
+def test_the_table_and_the_figure_come_out_of_the_whole_run(tmp_path):
+    typed(tmp_path, made_by_run())
     found = check(tmp_path / "outputs/headline")
     analysis = analyse([tmp_path / "outputs/headline"])
     assert block(analysis) in README

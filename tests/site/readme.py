@@ -33,10 +33,10 @@ _COLORS = 128
 
 def block(analysis: Analysis) -> str:
     """Returns the table and what it says, as they stand in README."""
-    return "\n".join([*_table(_view(analysis)), "", *_said(analysis)]) + "\n"
+    return "\n".join([*_table(view_of(analysis)), "", *_said(analysis)]) + "\n"
 
 
-def _view(analysis: Analysis) -> View:
+def view_of(analysis: Analysis) -> View:
     (view,), _ = views(analysis)
     return view
 
@@ -80,7 +80,7 @@ def write_readme(analysis: Analysis) -> None:
     write_text(INDEX, re.sub(r"(?m)^\*\*.*\*\*$", f"**{finding}**", index, count=1))
     with house_style():
         for dark, path in enumerate(PICTURES):
-            save(_view(analysis), path, dark=bool(dark))
+            save(view_of(analysis), path, dark=bool(dark))
 
 
 def save(view: View, path: Path, *, dark: bool = False) -> None:
