@@ -59,7 +59,7 @@ def test_trackers_of_singular_covariances_are_calibrated(names):
     of 22. Of each kind of tracker machine code is made, which takes most of the time."""
     trackers = {name: TRACKERS[name] for name in names}
     table = ib.run(
-        StateScenario(WalkingGins(gins=Gins(readings_per_case=2)), error_scale=10.0), trackers, 12
+        StateScenario(WalkingGins(gins=Gins(readings_per_case=4)), error_scale=10.0), trackers, 12
     )
     rows = table[table["parameter"] == "all"].set_index("estimator")
     assert (rows["converged"] == 1).all()
