@@ -11,6 +11,7 @@ reading that saturates is the same for any state that an unstable step leaves.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -88,24 +89,33 @@ def _largest(y: Array) -> Array:
     return np.abs(y).max(axis=3).max(axis=1)
 
 
-def search(
-    rungs: NDArray[np.int64],
-    tolerance: Array,
-    states: tuple[int, ...],
-    simulate: Callable[[Indices, int, Array, Array], None],
-    start: Indices,
-    unturned: Callable[[Array, Array], Array] = lambda h, z: h,
-    in_doubt: Callable[[Array], Mask] = lambda states: np.zeros(len(states), dtype=bool),
-) -> Found:
-    """Finds the coarsest rung at which readings hold `tolerance` (m,) and states `STATES`.
+@dataclass(frozen=True)
+class Asked:
+    """Holds what a search asks of a model."""
+
+    rungs: NDArray[np.int64]
+    """The ladder."""
+    tolerance: Array
+    """Tolerances (m,) of the readings."""
+    states: tuple[int, ...]
+    """Shape of a trial's states, (cases, states, times); a row behind these is held against
+    nothing."""
+    simulate: Callable[[Indices, int, Array, Array], None]
+    """Fills these rows of arrays (trials, m) and (trials, *states) with readings and states at one
+    rung."""
+    unturned: Callable[[Array, Array], Array]
+    """Shifts readings that are angles next to others."""
+    in_doubt: Callable[[Array], Mask]
+    """Selects trials by their states."""
+
+
+def search(asked: Asked, start: Indices) -> Found:
+    """Finds the coarsest rung at which readings hold their tolerance and states `STATES`.
 
     The search begins at the places `start` (trials,), 1 at least, and trials climb until they are
     accepted or at the top of the ladder, where they are lost unless they follow the solution.
-    `simulate` fills these rows of arrays (trials, m) and (trials, *states) with readings and states
-    (cases, states, times) at one rung, `unturned` shifts readings that are angles next to others,
-    and `in_doubt` selects trials by their states; a row behind these is held against nothing.
     """
-    climb = _Climb(rungs, tolerance, states, simulate, start, unturned, in_doubt)
+    climb = _Climb(asked, start)
     computed = np.arange(len(start))
     pending = computed
     while len(pending):
@@ -119,37 +129,26 @@ def search(
 class _Climb:
     """Holds what a search knows of each trial: readings and states at its rung n and at n/2."""
 
-    def __init__(
-        self,
-        rungs: NDArray[np.int64],
-        tolerance: Array,
-        states: tuple[int, ...],
-        simulate: Callable[[Indices, int, Array, Array], None],
-        start: Indices,
-        unturned: Callable[[Array, Array], Array],
-        in_doubt: Callable[[Array], Mask],
-    ) -> None:
-        trials = len(start)
-        self.rungs = rungs
-        self.top = len(rungs) - 1
-        self.tolerance = tolerance
-        self.simulate = simulate
-        self.unturned = unturned
-        self.in_doubt = in_doubt
+    def __init__(self, asked: Asked, start: Indices) -> None:
+        self.asked = asked
+        self.rungs = asked.rungs
+        self.top = len(asked.rungs) - 1
         # Where a model states its fastest rate, that bounds the steps: its states are held against
         # nothing, no step is in doubt, and their arrays have no rows.
-        self.has_states = states[1] > 0
+        self.has_states = asked.states[1] > 0
         self.tried = start.copy()
         """The place of n."""
         self.found = start.copy()
         """The place that is accepted, or would be at the top."""
+        trials = len(start)
         self.lost = np.zeros(trials, dtype=bool)
         self.doubtful = np.zeros(trials, dtype=bool)
-        self.fine = np.empty((trials, len(tolerance)))
+        readings = (trials, len(asked.tolerance))
+        self.fine = np.empty(readings)
         """Readings at n; of a trial that is accepted, those at the place that is found."""
-        self.coarse = np.empty((trials, len(tolerance)))
-        self.fine_states = np.empty((trials, *states))
-        self.coarse_states = np.empty((trials, *states))
+        self.coarse = np.empty(readings)
+        self.fine_states = np.empty((trials, *asked.states))
+        self.coarse_states = np.empty((trials, *asked.states))
         self.held = np.full(trials, -1)
         """The place whose readings are in `fine`, of trials that climb on."""
 
@@ -171,8 +170,8 @@ class _Climb:
         off = coarse_error / SAFETY if self.has_states else fine_error
         self.lost[rows] = (place == self.top) & (off > NOT_FOLLOWED)
         if self.has_states:
-            of_coarse = self.in_doubt(self.coarse_states[rows])
-            of_fine = self.in_doubt(self.fine_states[rows])
+            of_coarse = self.asked.in_doubt(self.coarse_states[rows])
+            of_fine = self.asked.in_doubt(self.fine_states[rows])
             self.doubtful[rows] = np.where(coarse_holds, of_coarse, of_fine)
         self.tried[rows] = self._next(place, fine_error)
         return rows[~(coarse_holds | fine_holds)]
@@ -183,8 +182,10 @@ class _Climb:
         self.coarse[rows[known]] = self.fine[rows[known]]
         self.coarse_states[rows[known]] = self.fine_states[rows[known]]
         if not known.all():
-            self.simulate(rows[~known], int(self.rungs[below]), self.coarse, self.coarse_states)
-        self.simulate(rows, int(self.rungs[place]), self.fine, self.fine_states)
+            self.asked.simulate(
+                rows[~known], int(self.rungs[below]), self.coarse, self.coarse_states
+            )
+        self.asked.simulate(rows, int(self.rungs[place]), self.fine, self.fine_states)
         self.held[rows] = place
 
     def _coarse_error(self, rows: Indices) -> Array:
@@ -195,8 +196,8 @@ class _Climb:
         # The last row behind the states tells of doubts, and is none of them.
         astray = apart(self.fine_states[rows, :, :-1], self.coarse_states[rows, :, :-1])
         with np.errstate(all="ignore"):
-            gaps = np.abs(fine - self.unturned(self.coarse[rows], fine))
-            shifts = (gaps / self.tolerance).max(axis=1)
+            gaps = np.abs(fine - self.asked.unturned(self.coarse[rows], fine))
+            shifts = (gaps / self.asked.tolerance).max(axis=1)
             error = SAFETY * np.maximum(shifts, astray / STATES)
         return np.nan_to_num(error, nan=np.inf)
 

@@ -314,9 +314,10 @@ class OdeMeasurement(Measurement):
         def simulate(rows: ladder.Indices, rung: int, z: Array, y: Array) -> None:
             self._simulate(x, rows, rung * self._parts, offset, z, y)
 
-        found = ladder.search(
-            self._rungs, self._tolerances, self._kept, simulate, start, self.near, self._in_doubt
+        asked = ladder.Asked(
+            self._rungs, self._tolerances, self._kept, simulate, self.near, self._in_doubt
         )
+        found = ladder.search(asked, start)
         doubtful = np.flatnonzero(found.doubtful & ~found.lost)
         if len(doubtful):
             z = found.z[np.searchsorted(found.computed, doubtful)] + offset
