@@ -11,10 +11,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from datetime import timedelta
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ipe_bench.basics.errors import shortened
-from ipe_bench.runs.schedule import Progress, Watcher
+
+if TYPE_CHECKING:
+    from ipe_bench.runs.schedule import Progress, Watcher
 
 Shows = bool | Literal["lines"]
 """Whether a terminal or a notebook shows progress; "lines" prints a line now and then elsewhere."""
