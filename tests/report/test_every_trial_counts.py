@@ -398,7 +398,10 @@ def cut_where_it_falls(shown: Any, analysis: Analysis) -> Iterator[str]:
     totals = analysis.totals
     if len(set(totals["error_scale"])) < 2 or "headline" not in shown:
         return
-    start = shown["headline"].figure.axes[0].get_xlim()[0]
+    first = shown["headline"].figure.axes[0]
+    # One scale alone has a row for each estimator, and no axis of scales.
+    drawn = first.get_xscale() == "log"
+    start = first.get_xlim()[0] if drawn else totals["error_scale"].max()
     cut = totals[totals["error_scale"] < start]
     for _, here in cut.groupby("error_scale"):
         for column in ("error_median", "error_q95"):
