@@ -618,7 +618,7 @@ class _Reader:
         what = f"the formula of {', '.join(names)}"
         self._refuse_bare(names)
         self._refuse_starts_of_columns()
-        if not columns and len(self._columns_left([])) > 1:
+        if not columns:
             self._refuse_without_column(names, self._last_value("measurement.reading") or usual)
         reading = self._reading_column(what, columns, usual)
         if not untyped and not typed:

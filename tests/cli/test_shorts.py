@@ -275,6 +275,10 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
             ["named.py", "longer.csv"],
             "names y, far; name them in the order of the arrays: ipe-bench",
         ),
+        (
+            ["a*t+b", "log.csv"],
+            "no name in the formula is a column (there are z); write the",
+        ),
         (["gins", "line.csv"], "gins: is not KEY=VALUE; write measurement=gins"),
         (["t+y", "line.csv"], "no column is left for the readings"),
         (["many.py", "three.csv"], "returns 2 arrays, and columns x, y, z are left for them; name"),
