@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -59,9 +59,39 @@ class Paths:
     """The readings (trials, K, m)."""
 
 
+class FixedParts(NamedTuple):
+    """Holds copies of those parts of a model that trackers take as numbers for all states."""
+
+    mean: Array
+    """(n,), of the prior"""
+    P: Array
+    """(n, n), its covariance"""
+    gains: Array
+    """G of each transition (K or K - 1, n, q); empty if it depends on the states."""
+    covariances: Array
+    """R of each epoch (K, m, m); empty if it depends on the states."""
+    periods: Array
+    state_periods: Array
+
+    @classmethod
+    def of(cls, model: StateModel) -> Self:
+        epochs = np.arange(model.epochs)
+        moving = epochs if model.moves(0) else epochs[1:]
+        gains = () if model.gain_by_state else model.gains(moving)
+        covariances = () if model.R_by_state else model.covariances(epochs)
+        parts = *model.prior, gains, covariances, model.periods, model.state_periods
+        return cls(*map(np.array, parts))
+
+    def same(self, other: FixedParts) -> bool:
+        return all(map(np.array_equal, self, other))
+
+
 class Kept(dict[Any, Any]):
     """Holds what is made of a model for trackers, and stays behind where that leaves the
     process."""
+
+    parts: FixedParts
+    """Those that all this is made of."""
 
     def __reduce__(self) -> tuple[type[Kept], tuple[()]]:
         return Kept, ()
@@ -187,11 +217,22 @@ class StateModel(Component, ABC):
             del vars(self)["_functions"]
         return self._functions[1]
 
-    def renew_functions(self) -> None:
-        """Forgets recorded functions that are not those of the model any more, such as after a
-        change of a table or a dictionary that they take numbers from."""
-        if "_functions" not in vars(self):
+    def renew(self) -> None:
+        """Forgets what is kept for trackers of a model that has changed since, such as by another
+        number in a table or a dictionary that it takes numbers from."""
+        if "_functions" in vars(self):
+            self._renew_functions()
+        if not self.passes:
             return
+        same = FixedParts.of(self).same(self.passes.parts)
+        if not same:
+            # Functions, too, were tried at states of the prior.
+            vars(self).pop("_functions", None)
+        # What noise by state is elsewhere is not known.
+        if not same or self.gain_by_state or self.R_by_state:
+            del vars(self)["passes"]
+
+    def _renew_functions(self) -> None:
         for name, functions in zip(_FUNCTIONS, self.epoch_functions, strict=True):
             try:
                 again = renumbered(functions, self, name)

@@ -104,6 +104,12 @@ class Formulas(StateModel):
         _check_inputs(self)
         _check_factors(self)
 
+    def renew(self) -> None:
+        # These classes are made of their options alone, which are not changed in place; those
+        # derived from them may take numbers from elsewhere.
+        if type(self).__module__ != __name__:
+            super().renew()
+
     @cached_property
     def _transitions(self) -> dict[str, Arithmetic]:
         return {name: parse(text, f"next.{name}") for name, text in self.next.items()}

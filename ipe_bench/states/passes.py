@@ -27,7 +27,7 @@ from ipe_bench.engine.scan import Step, gram
 from ipe_bench.engine.trace import RowPrograms
 from ipe_bench.states.algebra import factor, half, triangular
 from ipe_bench.states.along import EpochFunctions, Recording
-from ipe_bench.states.base import Kept, Normal, StateModel
+from ipe_bench.states.base import FixedParts, Kept, Normal, StateModel
 from ipe_bench.states.layouts import Layout, Shape, full, named_step, packed, triangle, unpacked
 from ipe_bench.states.linearisation import Linearised, Rule, SigmaPoints, Taylor
 from ipe_bench.states.steps import (
@@ -423,8 +423,8 @@ class Passes(ABC):
         self.kind = kind
         m = model.readings_per_epoch
         self.layouts = StepLayouts(model.n, m, kind.smooths, bool(kind.tails))
-        mean, P = model.prior
-        self.prior = mean, roots(P[None])[0]
+        parts = kept_of(model).parts
+        self.prior = parts.mean, roots(parts.P[None])[0]
 
     @abstractmethod
     def forward(self, z: Array, route: Route | None, carry: Array, output: Array) -> None:
@@ -493,15 +493,12 @@ class _Noise(NamedTuple):
     """(K, numbers)"""
 
     @classmethod
-    def of(cls, model: StateModel) -> Self:
-        K = model.epochs
-        moving = np.array([k for k in range(K) if model.moves(k)], dtype=int)
-        gains = model.gains(moving)
-        R_roots = factor(model.covariances(np.arange(K)))
-        G_mask = (gains != 0).any(axis=0)
+    def of(cls, parts: FixedParts) -> Self:
+        R_roots = factor(parts.covariances)
+        G_mask = (parts.gains != 0).any(axis=0)
         R_mask = (R_roots != 0).any(axis=0)
-        G = np.zeros((K, int(G_mask.sum())))
-        G[moving] = gains[:, G_mask]
+        G = np.zeros((len(R_roots), int(G_mask.sum())))
+        G[len(G) - len(parts.gains) :] = parts.gains[:, G_mask]
         return cls(G_mask, R_mask, G, R_roots[:, R_mask])
 
 
@@ -525,7 +522,7 @@ class _RecordedPasses(Passes):
         of_h, _ = h.places(model.epochs)
         # Epochs that share a recording of f and one of h share a step: a number for each pair.
         pairs = of_f * len(h.recordings) + of_h
-        noise = _Noise.of(model)
+        noise = _Noise.of(kept_of(model).parts)
         steps: dict[int, tuple[Step, Array]] = {}
         for pair in np.unique(pairs).tolist():
             steps[pair] = self._step_of(np.flatnonzero(pairs == pair), noise)
@@ -758,6 +755,7 @@ def kept_of(model: StateModel) -> Kept:
     # A copy with another prior or log begins with what is kept by what it was copied from.
     if kept.get("model") is not model or kept.get("functions") is not functions:
         kept = vars(model)["passes"] = Kept(model=model, functions=functions)
+        kept.parts = FixedParts.of(model)
     return kept
 
 

@@ -40,7 +40,7 @@ def believed(track: Callable[..., Any]) -> Callable[..., Any]:
         outside = _INSIDE.set(True)
         try:
             if not _UNCHANGED.get():
-                model.renew_functions()
+                model.renew()
             tracks = track(tracker, model, z)
             astray = _astray(model, tracks)
             rows = np.flatnonzero(astray)

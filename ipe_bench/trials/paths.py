@@ -127,7 +127,7 @@ class PathBlock:
 
     @classmethod
     def draw(cls, scenario: StateScenario, start: int, stop: int) -> PathBlock:
-        scenario.assumed.renew_functions()
+        scenario.assumed.renew()
         with np.errstate(all="ignore"):
             return cls(scenario, start, scenario.draw(start, stop))
 

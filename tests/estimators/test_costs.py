@@ -149,7 +149,7 @@ def seen(monkeypatch):
     functions within a recorded step cannot be counted from outside."""
     monkeypatch.setattr(passes, "_MOST_OPERATIONS", 0)
     monkeypatch.setattr(StateModel, "astray", lambda self, x: np.zeros(len(x), dtype=bool))
-    monkeypatch.setattr(StateModel, "renew_functions", lambda self: None)
+    monkeypatch.setattr(StateModel, "renew", lambda self: None)
     monkeypatch.setattr(Judged, "_doubted", lambda self, x, *_: np.zeros(len(x), dtype=bool))
     counted, values, slopes = Counter(), RowFunction.__call__, RowFunction.slopes
     arithmetic, product = set(), rows._product

@@ -12,7 +12,14 @@ from ipe_bench.functions.differences import RIGHT, WRONG, by_differences, judge,
 from ipe_bench.functions.judged import Judged
 from ipe_bench.functions.recording import NotRecorded, compiled_rows, written
 from ipe_bench.measurements import Parameter
-from ipe_bench.states import Normal, StateModel, ekf, ukf
+from ipe_bench.states import (
+    Grid,
+    Normal,
+    PathIPE,
+    StateModel,
+    ekf,
+    ukf,
+)
 
 SMOOTH = {
     "sin": (np.sin, np.cos),
@@ -372,6 +379,64 @@ def test_a_model_that_has_changed_is_tracked_as_it_stands(change, tracker, monke
     assert not np.array_equal(before.mean, after.mean)
     np.testing.assert_array_equal(after.mean, wanted.mean)
     np.testing.assert_array_equal(after.log_likelihood, wanted.log_likelihood)
+
+
+class Dictionary(StateModel):
+    """Takes its prior, its noise and its periods from a dictionary."""
+
+    name = "dictionary"
+    states: Any = (Parameter("p", "m"),)
+    times: Any = np.arange(1.0, 5.0)
+
+    def __init__(self):
+        self.numbers = {"mean": 0.0, "spread": 1.0, "process": 1.0, "reading": 2.0, "period": 0.0}
+
+    @property
+    def prior(self):
+        return Normal(np.array([self.numbers["mean"]]), self.numbers["spread"] ** 2 * np.eye(1))
+
+    @property
+    def periods(self):
+        return (self.numbers["period"],)
+
+    def transition(self, x, k):
+        return x + 0.1 * np.sin(x)
+
+    def observe(self, x, k):
+        return x + 0.05 * x**2
+
+    def gain(self, k):
+        return self.numbers["process"] * np.eye(1)
+
+    def R(self, k):
+        return self.numbers["reading"] ** 2 * np.eye(1)
+
+
+class DictionaryByState(Dictionary):
+    """Reads with noise that depends on the states."""
+
+    def R_at(self, x, k):
+        return self.numbers["reading"] ** 2 * (1 + 0.1 * x[..., None] ** 2)
+
+
+CHANGES = {"mean": 3.0, "spread": 4.0, "process": 0.2, "reading": 0.5, "period": 1.5}
+CASES = [(ekf(), Dictionary), (Grid(points=200), Dictionary), (PathIPE(), Dictionary)]
+CASES.append((ekf(), DictionaryByState))
+
+
+@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize(("tracker", "model_of"), CASES)
+def test_prior_and_noise_that_have_changed_are_taken_as_they_stand(tracker, model_of, name):
+    model = model_of()
+    z = model.draw(0, 2).z
+    tracker.track(model, z)
+    fresh = model_of()
+    for one in (model, fresh):
+        one.numbers[name] = CHANGES[name]
+    after = tracker.track(model, z)
+    wanted = tracker.track(fresh, z)
+    np.testing.assert_array_equal(after.mean, wanted.mean)
+    np.testing.assert_array_equal(after.covariance, wanted.covariance)
 
 
 class Folded(Ship):
