@@ -27,6 +27,7 @@ from ipe_bench.engine.scan import Step, gram, product
 from ipe_bench.states.layouts import Layout, Shape, full, named_step, triangle
 from ipe_bench.states.steps import (
     Linear,
+    Readings,
     Rows,
     State,
     Vector,
@@ -34,6 +35,7 @@ from ipe_bench.states.steps import (
     dot,
     lower,
     plus,
+    transposed,
     unit,
     updated,
     zeros,
@@ -65,9 +67,9 @@ def _eliminated(A: Rows, a: Vector, G: Rows, C: Rows, c: Vector) -> _Eliminated:
     """
     n = len(A[0])
     q = len(G[0])
-    right = [of - dot(a, column) for of, column in zip(c, _transposed(C), strict=True)]
-    of_noise = beside(product(_transposed(G), C), unit(q))
-    of_states = beside([*product(_transposed(A), C), right], zeros(n + 1, q))
+    right = [of - dot(a, column) for of, column in zip(c, transposed(C), strict=True)]
+    of_noise = beside(product(transposed(G), C), unit(q))
+    of_states = beside([*product(transposed(A), C), right], zeros(n + 1, q))
     L = lower([*of_noise, *of_states])
     R = [row[:q] for row in L[:q]]
     S = [row[:q] for row in L[q:-1]]
@@ -89,10 +91,6 @@ def _divided(G: Rows, R: Rows) -> Rows:
     return N
 
 
-def _transposed(A: Rows) -> Rows:
-    return [list(column) for column in zip(*A, strict=True)]
-
-
 def _damped(C: Rows, c: Vector, D: Vector | None) -> tuple[Rows, Vector]:
     """Adds x' diag(D)^2 x, which draws states to 0, to |C' x - c|^2."""
     if not D:
@@ -105,12 +103,12 @@ def passed_back(
     Y: Rows, y: Vector, A: Rows, B: Rows, a: Vector, v: Vector, G: Rows, D: Vector | None = None
 ) -> dict[str, Any]:
     """Takes in the readings of an epoch, and steps back to the one before."""
-    C, c = _damped(beside(_transposed(B), Y), [*v, *y], D)
+    C, c = _damped(beside(transposed(B), Y), [*v, *y], D)
     left = _eliminated(A, a, G, C, c)
     # Without noise a product with its slopes has no columns.
     moved = zeros(len(A), len(A))
     if left.pivots:
-        moved = product(left.N, _transposed(left.S))
+        moved = product(left.N, transposed(left.S))
     # M = A - N S' and b = a + N r.
     M = [
         [one - other for one, other in zip(row, by, strict=True)]
@@ -145,7 +143,7 @@ def spread_ahead(F: Rows, M: Rows, b: Vector, N: Rows) -> dict[str, Any]:
 def crossed_back(last: Rows, covariance: Rows, M: Rows) -> dict[str, Any]:
     """Computes covariances with the last states; `last` is the product of all M from here to
     them."""
-    return {"crossed": product(covariance, last), "last": product(_transposed(M), last)}
+    return {"crossed": product(covariance, last), "last": product(transposed(M), last)}
 
 
 def filtered(F: Rows, doubt: Vector, A: Rows, B: Rows, x: Vector, G: Rows) -> dict[str, Any]:
@@ -154,7 +152,7 @@ def filtered(F: Rows, doubt: Vector, A: Rows, B: Rows, x: Vector, G: Rows) -> di
     F = lower(beside(product(A, F), G))
     nothing = [0.0] * m
     linear = Linear(nothing, product(B, F), [], B)
-    found = updated(State(x, F), linear, unit(m), nothing, (), False)
+    found = updated(State(x, F), linear, unit(m), Readings(nothing, (), False))
     F = found.state.F
     most = np.maximum(doubt[0], found.doubt)
     return {"F": F, "doubt": [most], "variances": [dot(row, row) for row in F]}

@@ -33,6 +33,7 @@ from ipe_bench.states.linearisation import Linearised, Rule, SigmaPoints, Taylor
 from ipe_bench.states.steps import (
     Law,
     Linear,
+    Readings,
     Regression,
     Rows,
     Smoothed,
@@ -48,8 +49,6 @@ from ipe_bench.states.steps import (
     scores,
     unit,
     updated,
-    updated_by_parts,
-    within,
     zeros,
 )
 from ipe_bench.states.student import Mixture
@@ -261,8 +260,10 @@ class _RecordedStep:
                 # Angles may have gone around since the path's state, about which h is linearised.
                 state = State(near(state.x, path_here.x, self.state_periods), state.F)
         h = _RecordedFunction(self.h, d, self.periods)
-        z, update = self._update(h, state, z, R, path_here)
-        output = _filter_output(z, update, log_likelihood, doubt)
+        variances = [dot(row, row) for row in R]
+        readings = Readings(z, self.periods, self.kind.smooths, variances, self.kind.tails)
+        taken, update = self._update(h, state, readings, R, path_here)
+        output = _filter_output(taken.z, update, log_likelihood, doubt)
         return {**output, **_named_rows(rows, len(x))}
 
     @property
@@ -279,49 +280,30 @@ class _RecordedStep:
         return predicted(linear, law.noise(G, linear), self.kind.smooths)
 
     def _update(
-        self, h: _RecordedFunction, state: State, z: Vector, R: Rows, at: State | None
-    ) -> tuple[Vector, Update]:
+        self, h: _RecordedFunction, state: State, readings: Readings, R: Rows, at: State | None
+    ) -> tuple[Readings, Update]:
         """Returns the readings within the gate, and the update by them."""
         law = self._law
         linear = law(h, state, state if at is None else at)
-        variances = [dot(row, row) for row in R]
-        tails = self.kind.tails
-        if tails:
-            R = least_noise(R, tails)
+        if self.kind.tails:
+            R = least_noise(R, self.kind.tails)
         M = law.noise(R, linear)
         if self.kind.gate is not None:
             # What the first linearisation takes for missing is missing to all.
-            z = within(z, linear, M, self.periods, self.kind.gate)
-        given = z, self.periods, self.kind.smooths, variances, tails
-        update = _updated(state, linear, M, *given)
+            readings = readings.within(linear, M, self.kind.gate)
+        update = updated(state, linear, M, readings)
         for _ in range(1, self.kind.iterations):
             linear = law(h, state, update.state)
-            update = _updated(state, linear, law.noise(R, linear), *given)
+            update = updated(state, linear, law.noise(R, linear), readings)
         if at is not None and isinstance(law, Regression):
             # Slopes by points about a path that is nearly known may be round-off themselves.
             update = update._replace(doubt=0.0)
-        return z, update
+        return readings, update
 
 
 def _shape_of(mask: Array) -> Shape:
     """Returns the shape of a matrix of which only the numbers of a mask are kept."""
     return tuple(map(tuple, mask.tolist()))
-
-
-def _updated(
-    state: State,
-    linear: Linear,
-    M: Rows,
-    z: Vector,
-    periods: Sequence[float],
-    smooths: bool,
-    variances: Vector,
-    tails: Sequence[Mixture],
-) -> Update:
-    """Takes in readings with noise of the root M, or where that has tails with at least so much."""
-    if tails:
-        return updated_by_parts(state, linear, M, variances, tails, z, periods, smooths)
-    return updated(state, linear, M, z, periods, smooths)
 
 
 def _predict_step(
@@ -343,17 +325,19 @@ def _update_step(
     M: Rows,
     H: Rows,
     smooths: bool,
-    variances: Vector | None = None,
+    variances: Sequence[Any] = (),
     gate: float | None = None,
     tails: Sequence[Mixture] = (),
 ) -> dict[str, Any]:
     """Takes in readings by y = H x + b and H F, which are given as numbers, and noise of the root
     M."""
     linear = Linear(y, HF, [], H)
+    readings = Readings(z, (), smooths, variances, tails)
     if gate is not None:
-        z = within(z, linear, M, (), gate)
-    update = _updated(State(x, F), linear, M, z, (), smooths, variances or [], tails)
-    return {**_filter_output(z, update, log_likelihood, doubt), **_named_rows(None, len(x))}
+        readings = readings.within(linear, M, gate)
+    update = updated(State(x, F), linear, M, readings)
+    output = _filter_output(readings.z, update, log_likelihood, doubt)
+    return {**output, **_named_rows(None, len(x))}
 
 
 def _smoother_step(

@@ -1,15 +1,20 @@
-"""Steps of Gaussian filters and smoothers of one trial at one epoch, in lists of numbers: run on
-unknowns they leave a program for `engine.scan`, run on numbers they are its reference.
+"""Steps of Gaussian filters and smoothers of one trial at one epoch.
 
-A covariance is F F' with a triangular F, which orthogonal rows take from step to step (Bierman,
-Factorization Methods for Discrete Sequential Estimation, 1977); nothing is inverted, and nothing
-subtracted from a covariance:
+Vectors and matrices are lists of numbers. Run on unknowns the steps leave a program for
+`engine.scan`, run on numbers they are its reference. So conditions are `where`, a missing reading
+is a row of zeros, and loops have fixed lengths.
+
+Any number that is normal is written by independent unit noises v ~ N(0, I): states are x + F v,
+with a triangular F, so that F F' is their covariance. A step puts the rows of all numbers that
+matter below each other, and takes them by orthogonal rows to a triangular form, which leaves the
+covariances as they are (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977);
+nothing is inverted, and nothing subtracted from a covariance:
 
     predict   (A F, N)            ->  (F-, 0)            x- = A x + b,  N N' = Q + W
     update    (M, H F; 0, F-)     ->  (L, 0; X, F+)      x+ = x- + X e,  L e = y,  M M' = R + W
 
-Rows of (I, 0) below these give the old unit noise by the new one, which is all that a smoother
-takes. Conditions are `where`: a missing reading is a row of zeros.
+W is the covariance of what a linearisation leaves of f or h. Rows (0, I) below these, of the old
+unit noise v itself, become what it is by the new one, which is all that a smoother takes.
 """
 
 from __future__ import annotations
@@ -81,13 +86,314 @@ class Law(Protocol):
         ...
 
 
+class Tangent:
+    """Linearises by the tangent at a mean."""
+
+    def __call__(self, g: Function, state: State, at: State) -> Linear:
+        y, A = g.slopes(at.x)
+        return _taken_at(state, at, Linear(y, [], [[] for _ in y], A))
+
+    def noise(self, N: Rows, linear: Linear) -> Rows:
+        return N
+
+
+class Regression(NamedTuple):
+    """Linearises by statistical regression on points of the standard normal distribution."""
+
+    s: Rows
+    """(p, n)"""
+    w: Vector
+    """Weights (p) in means."""
+    c: Vector
+    """Weights (p) in covariances."""
+
+    def __call__(self, g: Function, state: State, at: State) -> Linear:
+        # A row for each of the values of g, with its numbers at the points.
+        values = transposed(self._values(g, at))
+        mean = [dot(self.w, row) for row in values]
+        off = [[a - middle for a in row] for row, middle in zip(values, mean, strict=True)]
+        # The covariance of values and points is A F, since that of points is I.
+        weighted = [[*map(mul, self.c, row)] for row in off]
+        across = transposed(self.s)
+        AF = [[dot(row, along) for along in across] for row in weighted]
+        left = []
+        for row, slopes in zip(off, AF, strict=True):
+            left.append([a - dot(slopes, s) for a, s in zip(row, self.s, strict=True)])
+        linear = Linear(mean, AF, left, over(AF, at.F))
+        return linear if at is state else _taken_at(state, at, linear)
+
+    def noise(self, N: Rows, linear: Linear) -> Rows:
+        left = linear.left
+        if min(self.c) >= 0:
+            deviations = np.sqrt(self.c)
+            return beside(N, [[*map(mul, deviations, row)] for row in left])
+        # A negative weight leaves a difference, which has no root of its own.
+        left = [self._told(*given) for given in zip(left, linear.AF, linear.y, strict=True)]
+        weighted = [[*map(mul, self.c, row)] for row in left]
+        W = []
+        for own, row in zip(N, weighted, strict=True):
+            pairs = zip(N, left, strict=True)
+            W.append([dot(own, noise, dot(row, other)) for noise, other in pairs])
+        return root(W)
+
+    def _values(self, g: Function, at: State) -> Rows:
+        """Computes g at the points (p, m)."""
+        values = [g(plus(at.x, at.F, point)) for point in self.s]
+        if not any(g.periods):
+            return values
+        # The mean of points on both sides of a jump would lie opposite.
+        center = g(at.x)
+        return [near(y, center, g.periods) for y in values]
+
+    def _told(self, left: Vector, AF: Vector, y: Number) -> Vector:
+        """Returns what is left of a value, or 0 where that is round-off."""
+        squares = [a * a for a in left]
+        sizes = [abs(one) for one in self.c]
+        rounded = _SMALL**2 * sum(sizes) * dot(AF, AF, y * y)
+        least = _SMALL * dot(sizes, squares) + rounded
+        none = np.less_equal(np.abs(dot(self.c, squares)), least)
+        return [np.where(none, 0.0, a) for a in left]
+
+
+def _taken_at(state: State, at: State, linear: Linear) -> Linear:
+    """Returns a law about the states `at`, taken at others."""
+    apart = [a - b for a, b in zip(state.x, at.x, strict=True)]
+    y = plus(linear.y, linear.A, apart)
+    return linear._replace(y=y, AF=product(linear.A, state.F))
+
+
+def predicted(linear: Linear, N: Rows, smooths: bool) -> tuple[State, Rows]:
+    """Returns the states after a transition with noise of the root N, and for a smoother rows
+    (X, Y): the old unit noise is X times the new one, and Y times another."""
+    n = len(N)
+    W = beside(linear.AF, N)
+    if smooths:
+        W += beside(unit(n), zeros(n, len(N[0])))
+    both = lower(W, n)
+    F = [row[:n] for row in both[:n]]
+    return State(linear.y, F), both[n:]
+
+
+class Readings(NamedTuple):
+    """Holds the readings of an epoch, and how they are taken in."""
+
+    z: Vector
+    """(m), NaN where missing"""
+    periods: Sequence[float]
+    """The period of each, or 0; empty if none has one."""
+    smooths: bool
+    """Whether a smoother follows, which takes rows of the update."""
+    variances: Sequence[Number] = ()
+    """R of each, if their noise has tails."""
+    tails: Sequence[Mixture] = ()
+    """The mixture of normal distributions that the noise of each is; empty if all are normal."""
+
+    def within(self, linear: Linear, M: Rows, most: float) -> Readings:
+        """Returns the readings with those missing whose squared innovation exceeds its variance by
+        more than a factor `most`."""
+        kept = []
+        y = near(linear.y, self.z, self.periods)
+        for reading, a, noise, slopes in zip(self.z, y, M, linear.AF, strict=True):
+            apart = reading - a
+            variance = dot(noise, noise, dot(slopes, slopes))
+            inside = np.less_equal(apart * apart, most * variance)
+            kept.append(np.where(inside, reading, np.nan))
+        return self._replace(z=kept)
+
+
+class Update(NamedTuple):
+    """Holds the states after readings, and what these say."""
+
+    state: State
+    e: Vector
+    """Normalised innovations (m), 0 of missing readings."""
+    L: Rows
+    """L L' is the covariance of innovations; rows of 0 of missing readings."""
+    doubt: Number
+    """The largest variance of what is read by the digits of a float, in parts of a reading's."""
+    told: Rows
+    """For a smoother rows (X, Y): the old unit noise is X e, and Y times the new one. Other noise
+    is left of it in columns that the root of the states has not."""
+    judged: dict[str, Vector]
+    """Of readings with tails (m,), which have no L: those `predicted`, the standard `deviation` of
+    each innovation, given the readings in front of it the innovation `apart` and `others`, its
+    variance with the least noise, and `own`, that of the reading."""
+
+
+def updated(state: State, linear: Linear, M: Rows, readings: Readings) -> Update:
+    """Takes in readings with noise of the root M; if that has tails, M is a root of its least
+    normal distributions."""
+    if readings.tails:
+        return _updated_one_by_one(state, linear, M, readings)
+    m = len(M)
+    n = len(state.x)
+    seen, y, W, doubt = _prepared(state, linear, M, readings)
+    both = lower(W, m + n)
+    L = [row[:m] for row in both[:m]]
+    e: Vector = []
+    for i, (there, row) in enumerate(zip(seen, L, strict=True)):
+        rest = y[i] - dot(row[:i], e)
+        e.append(np.where(there, rest, 0.0) / np.where(there, row[i], 1.0))
+    of_states = both[m : m + n]
+    x = plus(state.x, [row[:m] for row in of_states], e)
+    F = [row[m : m + n] for row in of_states]
+    told = [row[: m + n] for row in both[m + n :]]
+    return Update(State(x, F), e, L, doubt, told, {})
+
+
+def least_noise(R: Rows, tails: Sequence[Mixture]) -> Rows:
+    """Returns a root of the least noise of readings whose noise has the root R."""
+    pairs = zip(R, tails, strict=True)
+    return [[np.sqrt(one.least) * a for a in row] for row, one in pairs]
+
+
+def _updated_one_by_one(state: State, linear: Linear, M: Rows, readings: Readings) -> Update:
+    """Takes in readings one after another whose noise is a mixture each.
+
+    After each the states have the mean and the covariance of all normal distributions that they
+    are by then. A row then is less by its covariance with the innovation, and has one more column,
+    which keeps its variance: what the noise of the reading hides, and how far apart the means are.
+    """
+    m = len(M)
+    n = len(state.x)
+    seen, y, rows, doubt = _prepared(state, linear, M, readings)
+    judged = _judged_before(y, rows, readings)
+    e: Vector = []
+    others: Vector = []
+    # How the number of each row moves with the innovations so far.
+    X: Rows = [[] for _ in rows]
+    for j in range(m):
+        reading, *rows = rows
+        variance = np.where(seen[j], dot(reading, reading), 1.0)
+        others.append(variance)
+        found = evidence(y[j], variance, readings.variances[j], readings.tails[j])
+        by_e = np.sqrt(found.gain)
+        e.append(y[j] * by_e)
+        left = np.sqrt(found.left)
+        for i, row in enumerate(rows):
+            share = dot(row, reading)
+            kept = [a - share * found.gain * b for a, b in zip(row, reading, strict=True)]
+            rows[i] = [*kept, share * left]
+            X[j + 1 + i].append(share * by_e)
+        for i in range(j + 1, m):
+            y[i] = y[i] - X[i][j] * e[j]
+    # Rows of the readings are gone: those of the states are in front.
+    both = lower(rows)
+    x = plus(state.x, X[m : m + n], e)
+    F = [row[:n] for row in both[:n]]
+    judged |= {"apart": y, "others": others, "own": [*readings.variances]}
+    told: Rows = []
+    if readings.smooths:
+        told = beside(X[m + n :], [row[:n] for row in both[n:]])
+    return Update(State(x, F), e, unit(m), doubt, told, judged)
+
+
+def _judged_before(y: Vector, rows: Rows, readings: Readings) -> dict[str, Vector]:
+    """Returns the readings with tails that are predicted, and the deviations of innovations y."""
+    deviations = []
+    for R, tail, row in zip(readings.variances, readings.tails, rows, strict=False):
+        deviations.append(np.sqrt(dot(row, row, (1 - tail.least) * R)))
+    predicted = [a - b for a, b in zip(readings.z, y, strict=True)]
+    return {"predicted": predicted, "deviation": deviations}
+
+
+class _Prepared(NamedTuple):
+    """Holds what readings say before they are taken in."""
+
+    seen: Vector
+    """Whether each is there."""
+    y: Vector
+    """Innovations, 0 of missing readings."""
+    W: Rows
+    """Rows of readings by their noise and the states' unit noise, 0 of missing ones, above those of
+    the states, and for a smoother of the unit noise itself."""
+    doubt: Number
+
+
+def _prepared(state: State, linear: Linear, M: Rows, readings: Readings) -> _Prepared:
+    n = len(state.x)
+    columns = len(M[0])
+    seen = [np.less_equal(a, a) for a in readings.z]
+    expected = near(linear.y, readings.z, readings.periods)
+    y = []
+    read = []
+    rows = beside(M, linear.AF)
+    for there, a, b, row in zip(seen, readings.z, expected, rows, strict=True):
+        y.append(np.where(there, a - b, 0.0))
+        read.append([np.where(there, one, 0.0) for one in row])
+    W = read + beside(zeros(n, columns), state.F)
+    if readings.smooths:
+        W += beside(zeros(n, columns), unit(n))
+    noise = [row[:columns] for row in read]
+    return _Prepared(seen, y, W, _doubt(state, linear.A, noise))
+
+
+def _doubt(state: State, H: Rows, M: Rows) -> Number:
+    """Compares the variance of states, as readings of slopes H see it, with that of their noise of
+    the root M: `Update.doubt`."""
+    sizes = []
+    for x, row in zip(state.x, state.F, strict=True):
+        sizes.append(np.maximum(dot(row, row), _HIDDEN * (x * x)))
+    most: Number = 0.0
+    for slopes, noise in zip(H, M, strict=True):
+        read = dot([a * a for a in slopes], sizes)
+        own = dot(noise, noise)
+        none = np.less_equal(own, 0.0)
+        most = np.maximum(most, np.where(none, 0.0, read) / np.where(none, 1.0, own))
+    return most
+
+
+def scores(e: Vector, L: Rows) -> tuple[Number, Number]:
+    """Computes the NIS and the log likelihood of normalised innovations."""
+    nis = dot(e, e)
+    pivots = [row[i] for i, row in enumerate(L)]
+    sizes = [np.where(np.less_equal(one, 0.0), 1.0, 2 * np.pi * one * one) for one in pivots]
+    return nis, -0.5 * reduce(add, map(np.log, sizes), nis)
+
+
+class Smoothed(NamedTuple):
+    """Holds states x + F (u + S w), w ~ N(0, I), given all readings, of those x + F v with
+    v ~ N(0, I) that a filter has."""
+
+    u: Vector
+    S: Rows
+
+    def of(self, state: State) -> State:
+        return State(plus(state.x, state.F, self.u), lower(product(state.F, self.S)))
+
+    def before(self, e: Vector, read: Rows, moved: Rows) -> Smoothed:
+        """Returns the same of the epoch before, by what an update and a transition told."""
+        m = len(e)
+        n = len(self.u)
+        u = plus([0.0] * n, read, [*e, *self.u])
+        S = lower(product([row[m:] for row in read], self.S))
+        X = [row[:n] for row in moved]
+        Y = [row[n:] for row in moved]
+        return Smoothed(plus([0.0] * n, X, u), lower(beside(product(X, S), Y)))
+
+
+def near(y: Vector, to: Vector, periods: Sequence[float]) -> Vector:
+    """Shifts values by whole periods next to others."""
+    if not any(periods):
+        return y
+    shifted = []
+    for a, b, period in zip(y, to, periods, strict=True):
+        shifted.append(a - period * np.floor((a - b) / period + 0.5) if period else a)
+    return shifted
+
+
 def plus(x: Sequence[Number], A: Rows, u: Sequence[Number]) -> Vector:
     """Computes x + A u."""
     return [dot(row, u, start) for start, row in zip(x, A, strict=True)]
 
 
 def beside(*blocks: Rows) -> Rows:
+    """Puts matrices side by side."""
     return [[a for row in rows for a in row] for rows in zip(*blocks, strict=True)]
+
+
+def transposed(A: Rows) -> Rows:
+    return [list(column) for column in zip(*A, strict=True)]
 
 
 def zeros(rows: int, columns: int) -> Rows:
@@ -134,269 +440,3 @@ def root(W: Rows) -> Rows:
         for i in range(j + 1, n):
             F[i][j] = (W[i][j] - dot(F[i][:j], F[j][:j])) * inverse
     return F
-
-
-def near(y: Vector, to: Vector, periods: Sequence[float]) -> Vector:
-    """Shifts values by whole periods next to others."""
-    if not any(periods):
-        return y
-    shifted = []
-    for a, b, period in zip(y, to, periods, strict=True):
-        shifted.append(a - period * np.floor((a - b) / period + 0.5) if period else a)
-    return shifted
-
-
-class Tangent:
-    """Linearises by the tangent at a mean."""
-
-    def __call__(self, g: Function, state: State, at: State) -> Linear:
-        y, A = g.slopes(at.x)
-        apart = [a - b for a, b in zip(state.x, at.x, strict=True)]
-        return Linear(plus(y, A, apart), product(A, state.F), [[] for _ in y], A)
-
-    def noise(self, N: Rows, linear: Linear) -> Rows:
-        return N
-
-
-class Regression(NamedTuple):
-    """Linearises by statistical regression on points of the standard normal distribution."""
-
-    s: Rows
-    """(p, n)"""
-    w: Vector
-    """Weights (p) in means."""
-    c: Vector
-    """Weights (p) in covariances."""
-
-    def __call__(self, g: Function, state: State, at: State) -> Linear:
-        values = [g(plus(at.x, at.F, point)) for point in self.s]
-        if any(g.periods):
-            # The mean of points on both sides of a jump would lie opposite.
-            center = g(at.x)
-            values = [near(y, center, g.periods) for y in values]
-        columns = [list(column) for column in zip(*values, strict=True)]
-        mean = [dot(self.w, column) for column in columns]
-        off = [[a - middle for a in column] for column, middle in zip(columns, mean, strict=True)]
-        weighted = [[*map(mul, self.c, column)] for column in off]
-        AF = [[dot(row, along) for along in zip(*self.s, strict=True)] for row in weighted]
-        left = []
-        for column, row in zip(off, AF, strict=True):
-            left.append([a - dot(row, s) for a, s in zip(column, self.s, strict=True)])
-        A = over(AF, at.F)
-        if at is state:
-            return Linear(mean, AF, left, A)
-        apart = [a - b for a, b in zip(state.x, at.x, strict=True)]
-        return Linear(plus(mean, A, apart), product(A, state.F), left, A)
-
-    def noise(self, N: Rows, linear: Linear) -> Rows:
-        left = linear.left
-        if min(self.c) >= 0:
-            deviations = np.sqrt(self.c)
-            return beside(N, [[*map(mul, deviations, row)] for row in left])
-        # A negative weight leaves a difference, which has no root of its own.
-        left = [self._told(*given) for given in zip(left, linear.AF, linear.y, strict=True)]
-        weighted = [[*map(mul, self.c, row)] for row in left]
-        W = []
-        for own, row in zip(N, weighted, strict=True):
-            pairs = zip(N, left, strict=True)
-            W.append([dot(own, noise, dot(row, other)) for noise, other in pairs])
-        return root(W)
-
-    def _told(self, left: Vector, AF: Vector, y: Number) -> Vector:
-        """Returns what is left of a value, or 0 where that is round-off."""
-        squares = [a * a for a in left]
-        sizes = [abs(one) for one in self.c]
-        rounded = _SMALL**2 * sum(sizes) * dot(AF, AF, y * y)
-        least = _SMALL * dot(sizes, squares) + rounded
-        none = np.less_equal(np.abs(dot(self.c, squares)), least)
-        return [np.where(none, 0.0, a) for a in left]
-
-
-def predicted(linear: Linear, N: Rows, smooths: bool) -> tuple[State, Rows]:
-    """Returns the states after a transition with noise of the root N, and for a smoother rows
-    (X, Y): the old unit noise is X times the new one, and Y times another."""
-    n = len(N)
-    W = beside(linear.AF, N)
-    W += beside(unit(n), zeros(n, len(N[0]))) if smooths else []
-    both = lower(W, n)
-    return State(linear.y, [row[:n] for row in both[:n]]), both[n:]
-
-
-class Update(NamedTuple):
-    """Holds the states after readings, and what these say."""
-
-    state: State
-    e: Vector
-    """Normalised innovations (m), 0 of missing readings."""
-    L: Rows
-    """L L' is the covariance of innovations; rows of 0 of missing readings."""
-    doubt: Number
-    """The largest variance of what is read by the digits of a float, in parts of a reading's."""
-    told: Rows
-    """For a smoother rows (X, Y): the old unit noise is X e, and Y times the new one. Other noise
-    is left of it in columns that the root of the states has not."""
-    judged: dict[str, Vector]
-    """Of readings with tails (m,), which have no L: those `predicted`, the standard `deviation` of
-    each innovation, given the readings in front of it the innovation `apart` and `others`, its
-    variance with the least noise, and `own`, that of the reading."""
-
-
-def within(z: Vector, linear: Linear, M: Rows, periods: Sequence[float], most: float) -> Vector:
-    """Returns readings z with those missing whose squared innovation exceeds its variance by more
-    than a factor `most`."""
-    kept = []
-    y = near(linear.y, z, periods)
-    for reading, a, own, told in zip(z, y, M, linear.AF, strict=True):
-        apart = reading - a
-        variance = dot(own, own, dot(told, told))
-        kept.append(np.where(np.less_equal(apart * apart, most * variance), reading, np.nan))
-    return kept
-
-
-class _Given(NamedTuple):
-    """Holds what readings say before they are taken in."""
-
-    seen: Vector
-    y: Vector
-    """Innovations, 0 of missing readings."""
-    W: Rows
-    """Rows of their noise and of the states' unit noise, 0 of missing readings, above those of the
-    states, and for a smoother of the unit noise itself."""
-    doubt: Number
-
-    @classmethod
-    def of(
-        cls,
-        state: State,
-        linear: Linear,
-        M: Rows,
-        z: Vector,
-        periods: Sequence[float],
-        smooths: bool,
-    ) -> _Given:
-        n = len(state.x)
-        columns = len(M[0])
-        seen = [np.less_equal(a, a) for a in z]
-        y = near(linear.y, z, periods)
-        y = [np.where(there, a - b, 0.0) for there, a, b in zip(seen, z, y, strict=True)]
-        read = []
-        for there, row in zip(seen, beside(M, linear.AF), strict=True):
-            read.append([np.where(there, a, 0.0) for a in row])
-        W = read + beside(zeros(n, columns), state.F)
-        W += beside(zeros(n, columns), unit(n)) if smooths else []
-        return cls(seen, y, W, _doubt(state, linear.A, [row[:columns] for row in read]))
-
-
-def updated(
-    state: State, linear: Linear, M: Rows, z: Vector, periods: Sequence[float], smooths: bool
-) -> Update:
-    """Takes in readings z, NaN where missing, with noise of the root M."""
-    m = len(z)
-    n = len(state.x)
-    seen, y, W, doubt = _Given.of(state, linear, M, z, periods, smooths)
-    both = lower(W, m + n)
-    L = [row[:m] for row in both[:m]]
-    e: Vector = []
-    for i, (there, row) in enumerate(zip(seen, L, strict=True)):
-        rest = y[i] - dot(row[:i], e)
-        e.append(np.where(there, rest, 0.0) / np.where(there, row[i], 1.0))
-    after = both[m : m + n]
-    x = plus(state.x, [row[:m] for row in after], e)
-    F = [row[m : m + n] for row in after]
-    return Update(State(x, F), e, L, doubt, [row[: m + n] for row in both[m + n :]], {})
-
-
-def least_noise(R: Rows, tails: Sequence[Mixture]) -> Rows:
-    """Returns a root of the least noise of readings whose noise has the root R."""
-    pairs = zip(R, tails, strict=True)
-    return [[np.sqrt(one.least) * a for a in row] for row, one in pairs]
-
-
-def updated_by_parts(
-    state: State,
-    linear: Linear,
-    M: Rows,
-    own: Vector,
-    tails: Sequence[Mixture],
-    z: Vector,
-    periods: Sequence[float],
-    smooths: bool,
-) -> Update:
-    """Takes in readings z, NaN where missing, one after another, whose noise of the variances `own`
-    is a mixture each; M is a root of the least noise. The states after it have the mean and the
-    covariance of all normal distributions that they are by now."""
-    m = len(z)
-    n = len(state.x)
-    seen, y, rows, doubt = _Given.of(state, linear, M, z, periods, smooths)
-    predicted = [a - b for a, b in zip(z, y, strict=True)]
-    deviation = []
-    for R, part, row in zip(own, tails, rows, strict=False):
-        deviation.append(np.sqrt(dot(row, row, (1 - part.least) * R)))
-    e: Vector = []
-    others: Vector = []
-    # How each row moves with the innovations so far.
-    X: Rows = [[] for _ in rows]
-    for j in range(m):
-        first, *rows = rows
-        v = np.where(seen[j], dot(first, first), 1.0)
-        one = evidence(y[j], v, own[j], tails[j])
-        by_e = np.sqrt(one.gain)
-        e.append(y[j] * by_e)
-        others.append(v)
-        left = np.sqrt(one.left)
-        for i, row in enumerate(rows):
-            share = dot(row, first)
-            kept = [a - share * one.gain * b for a, b in zip(row, first, strict=True)]
-            rows[i] = [*kept, share * left]
-            X[j + 1 + i].append(share * by_e)
-        for i in range(j + 1, m):
-            y[i] = y[i] - X[i][j] * e[j]
-    both = lower(rows)
-    x = plus(state.x, X[m : m + n], e)
-    F = [row[:n] for row in both[:n]]
-    judged = {"predicted": predicted, "deviation": deviation}
-    judged |= {"apart": y, "others": others, "own": own}
-    back = beside(X[m + n :], [row[:n] for row in both[n:]]) if smooths else []
-    return Update(State(x, F), e, unit(m), doubt, back, judged)
-
-
-def _doubt(state: State, H: Rows, M: Rows) -> Number:
-    sizes = []
-    for x, row in zip(state.x, state.F, strict=True):
-        sizes.append(np.maximum(dot(row, row), _HIDDEN * (x * x)))
-    most: Number = 0.0
-    for slopes, noise in zip(H, M, strict=True):
-        read = dot([a * a for a in slopes], sizes)
-        own = dot(noise, noise)
-        none = np.less_equal(own, 0.0)
-        most = np.maximum(most, np.where(none, 0.0, read) / np.where(none, 1.0, own))
-    return most
-
-
-def scores(e: Vector, L: Rows) -> tuple[Number, Number]:
-    """Computes the NIS and the log likelihood of normalised innovations."""
-    nis = dot(e, e)
-    pivots = [row[i] for i, row in enumerate(L)]
-    sizes = [np.where(np.less_equal(one, 0.0), 1.0, 2 * np.pi * one * one) for one in pivots]
-    return nis, -0.5 * reduce(add, map(np.log, sizes), nis)
-
-
-class Smoothed(NamedTuple):
-    """Holds states x + F (u + S w), w ~ N(0, I), given all readings, of those x + F v with
-    v ~ N(0, I) that a filter has."""
-
-    u: Vector
-    S: Rows
-
-    def of(self, state: State) -> State:
-        return State(plus(state.x, state.F, self.u), lower(product(state.F, self.S)))
-
-    def before(self, e: Vector, read: Rows, moved: Rows) -> Smoothed:
-        """Returns the same of the epoch before, by what an update and a transition told."""
-        m = len(e)
-        n = len(self.u)
-        u = plus([0.0] * n, read, [*e, *self.u])
-        S = lower(product([row[m:] for row in read], self.S))
-        X = [row[:n] for row in moved]
-        Y = [row[n:] for row in moved]
-        return Smoothed(plus([0.0] * n, X, u), lower(beside(product(X, S), Y)))
