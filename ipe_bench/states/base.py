@@ -67,7 +67,8 @@ class FixedParts(NamedTuple):
     P: Array
     """(n, n), its covariance"""
     gains: Array
-    """G of each transition (K or K - 1, n, q); empty if it depends on the states."""
+    """G of the transition into each epoch (K, n, q), 0 where none leads; empty if it depends on the
+    states."""
     covariances: Array
     """R of each epoch (K, m, m); empty if it depends on the states."""
     periods: Array
@@ -77,7 +78,11 @@ class FixedParts(NamedTuple):
     def of(cls, model: StateModel) -> Self:
         epochs = np.arange(model.epochs)
         moving = epochs if model.moves(0) else epochs[1:]
-        gains = () if model.gain_by_state else model.gains(moving)
+        gains = np.empty(0)
+        if not model.gain_by_state:
+            moved = model.gains(moving)
+            still = np.zeros((len(epochs) - len(moving), *moved.shape[1:]))
+            gains = np.concatenate([still, moved])
         covariances = () if model.R_by_state else model.covariances(epochs)
         parts = *model.prior, gains, covariances, model.periods, model.state_periods
         return cls(*map(np.array, parts))

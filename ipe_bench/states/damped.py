@@ -20,7 +20,7 @@ from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.left_out import leaving_out
 from ipe_bench.states.linearisation import Taylor, Unscented
 from ipe_bench.states.saddles import at_saddles
-from ipe_bench.states.smoothers import path_p, whole
+from ipe_bench.states.smoothers import path_p, tracks_of, whole
 from ipe_bench.states.trackers import Tracker, Tracks, passed
 from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 from ipe_bench.states.widened import widened
@@ -298,16 +298,9 @@ def reported(density: PathDensity, paths: Descent) -> tuple[Tracks, Array]:
     logarithm of the volume (trials,) about each: of its probability over its density."""
     model = density.model
     at = density.settled_exactly(paths.at)
-    out = Tracks.empty(model, len(at.x))
     tangents = density.tangents(at)
     around = widened(density, at, tangents)
-    P = around.P
-    P[density.beyond_digits(tangents, at.x)] = np.nan
-    out.start = Normal(at.x[:, 0], P[:, 0])
-    out.mean = at.x[:, 1:]
-    out.covariance = P[:, 1:]
-    out.cost = at.misfit
-    out.weights = density.weights(at)
+    out = tracks_of(density, at, at.x, tangents, around.P)
     out.status = paths.status
     out.iterations = paths.iterations
     of_tangents = Taylor().calls(model.n) * model.evaluations

@@ -217,7 +217,7 @@ class _Frozen:
         gains = [root(model.prior.covariance), *steps]
         # A missing reading has unit variance, and no slope.
         both = seen[:, :, None] & seen[:, None, :]
-        R = np.where(both, [model.R(k) for k in epochs], np.eye(m))
+        R = np.where(both, kept_of(model).parts.covariances, np.eye(m))
         whitening = lower_solve(factor(R), np.eye(m))
         none = np.empty(0)
         start = cls(model, gains, seen, whitening, _Slopes(none, none), none)

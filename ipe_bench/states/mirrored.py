@@ -13,6 +13,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.states.base import Normal
 from ipe_bench.states.damped import ALIKE, Descent, LevenbergMarquardtSmoother, reported
 from ipe_bench.states.linearisation import Taylor
+from ipe_bench.states.saddles import led_from
 from ipe_bench.states.trackers import Tracks, passed
 from ipe_bench.states.whole_paths import PathDensity, Settled
 
@@ -112,17 +113,11 @@ def ordered(paths: Descent, other: Descent) -> tuple[Descent, Descent, Mask]:
 def _unread(density: PathDensity) -> Settled:
     """Computes the path without noise from the prior's mean, which no readings have moved."""
     model = density.model
-    x = model.prior.mean[None]
-    path = [x]
-    transitions = 0
-    for k in range(model.epochs):
-        if model.moves(k):
-            x = model.transition_into(k)(x)
-            transitions += 1
-        path.append(x)
-    at = density.settled(np.repeat(np.stack(path, axis=1), len(density.z), axis=0))
+    still = np.zeros((1, model.epochs, model.n))
+    x = led_from(model, model.prior.mean[None], still)
+    at = density.settled(np.repeat(x, len(density.z), axis=0))
     # A trial that is alone pays for these transitions, too.
-    return replace(at, calls=at.calls + transitions)
+    return replace(at, calls=at.calls + model.evaluations - model.epochs)
 
 
 def with_second(density: PathDensity, paths: Descent, other: Descent) -> Tracks:

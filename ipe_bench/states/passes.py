@@ -324,10 +324,10 @@ def _update_step(
     HF: Rows,
     M: Rows,
     H: Rows,
+    variances: Vector,
     smooths: bool,
-    variances: Sequence[Any] = (),
-    gate: float | None = None,
-    tails: Sequence[Mixture] = (),
+    gate: float | None,
+    tails: Sequence[Mixture],
 ) -> dict[str, Any]:
     """Takes in readings by y = H x + b and H F, which are given as numbers, and noise of the root
     M."""
@@ -481,9 +481,7 @@ class _Noise(NamedTuple):
         R_roots = factor(parts.covariances)
         G_mask = (parts.gains != 0).any(axis=0)
         R_mask = (R_roots != 0).any(axis=0)
-        G = np.zeros((len(R_roots), int(G_mask.sum())))
-        G[len(G) - len(parts.gains) :] = parts.gains[:, G_mask]
-        return cls(G_mask, R_mask, G, R_roots[:, R_mask])
+        return cls(G_mask, R_mask, parts.gains[:, G_mask], R_roots[:, R_mask])
 
 
 class _Stretch(NamedTuple):
@@ -593,11 +591,8 @@ class _PassesByEpoch(Passes):
         n = self.layouts.n
         m = self.layouts.m
         each: dict[str, Shape] = {"z": m, "y": m, "HF": full(m, n), "M": full(m, columns)}
-        each["H"] = full(m, n)
-        options: dict[str, Any] = {"smooths": self.kind.smooths, "gate": gate}
-        if self.kind.tails:
-            each["variances"] = m
-            options["tails"] = self.kind.tails
+        each |= {"H": full(m, n), "variances": m}
+        options = {"smooths": self.kind.smooths, "gate": gate, "tails": self.kind.tails}
         return self._made(_update_step, options, each, self.layouts.filter_output)
 
     def _made(
@@ -678,9 +673,8 @@ class _PassesByEpoch(Passes):
             y, HF = _at(law, state, at)
             y = model.nearest(y, np.where(np.isfinite(z), z, y))
             H = np.zeros(HF.shape) if slopes_in_doubt else law.slopes(at.F)
-            each = [z, y, HF, M, H]
-            if self.kind.tails:
-                each.append(np.broadcast_to(np.diagonal(R, axis1=1, axis2=2), z.shape))
+            variances = np.broadcast_to(np.diagonal(R, axis1=1, axis2=2), z.shape)
+            each = [z, y, HF, M, H, variances]
             # Each iteration takes the readings in anew.
             carry[:] = predicted_carry
             output[:] = _run(self._reading(M.shape[2], gate), carry, each)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array, Mask, finite, multiply
 from ipe_bench.states.algebra import root
-from ipe_bench.states.base import Normal
+from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.whole_paths import PathDensity, Settled
 
 _BLIND = 1e-9
@@ -34,7 +34,7 @@ def at_saddles(density: PathDensity, at: Settled, start: Normal) -> tuple[Mask, 
     x = at.x[rows]
     u = multiply(np.linalg.pinv(G), x[:, 0] - density.model.prior.mean)
     step = untold[rows]
-    moved = some.settled(_led_from(some, x[:, 0] + multiply(G, step), at.gap[rows]))
+    moved = some.settled(led_from(some.model, x[:, 0] + multiply(G, step), at.gap[rows]))
     affine = at.cost[rows] + ((u + step) ** 2 - u**2).sum(axis=1)
     found[rows] = ~(np.abs(moved.cost - affine) <= _AFFINE * (1 + affine))
     calls[rows] = moved.calls + density.model.evaluations
@@ -56,9 +56,9 @@ def _untold(G: Array, covariance: Array) -> Array:
     return u / np.where(size > 0, size, 1.0)
 
 
-def _led_from(density: PathDensity, start: Array, gap: Array) -> Array:
-    """Returns the paths (trials, 1 + K, n) from starts (trials, n), with the noise of others."""
-    model = density.model
+def led_from(model: StateModel, start: Array, gap: Array) -> Array:
+    """Returns the paths (trials, 1 + K, n) from starts (trials, n), with noise gap (trials, K,
+    n)."""
     x = start
     path = [x]
     for k in range(model.epochs):

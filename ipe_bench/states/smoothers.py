@@ -15,7 +15,7 @@ from ipe_bench.basics.options import Count, NonNegative
 from ipe_bench.states.base import Normal, StateModel
 from ipe_bench.states.linearisation import Rule, Taylor
 from ipe_bench.states.trackers import Filter, Tracker, Tracks, smoothed
-from ipe_bench.states.whole_paths import PathDensity, Settled
+from ipe_bench.states.whole_paths import PathDensity, Settled, Tangents
 
 _HALVINGS = 11
 """Halvings of a damped step at most."""
@@ -148,15 +148,9 @@ class IteratedSmoother(Tracker):
         if self.damped:
             end = density.settled_exactly(end)
             x = end.x
-            calls = calls + end.calls
+            calls += end.calls
         P = density.spread(tangents, end).covariance
-        P[density.beyond_digits(tangents, x)] = np.nan
-        out = Tracks.empty(model, len(x))
-        out.start = Normal(x[:, 0], P[:, 0])
-        out.mean = x[:, 1:]
-        out.covariance = P[:, 1:]
-        out.cost = end.misfit
-        out.weights = density.weights(end)
+        out = tracks_of(density, end, x, tangents, P)
         out.calls = calls
         return out
 
@@ -190,6 +184,19 @@ class IteratedSmoother(Tracker):
             path.cost = end.misfit
             path.calls = calls + end.calls
         return path
+
+
+def tracks_of(density: PathDensity, at: Settled, x: Array, tangents: Tangents, P: Array) -> Tracks:
+    """Returns the tracks of paths x (trials, 1 + K, n), which are settled `at`, with covariances P
+    (trials, 1 + K, n, n), NaN where tangents say that no digits are left of them."""
+    P[density.beyond_digits(tangents, x)] = np.nan
+    out = Tracks.empty(density.model, len(x))
+    out.start = Normal(x[:, 0], P[:, 0])
+    out.mean = x[:, 1:]
+    out.covariance = P[:, 1:]
+    out.cost = at.misfit
+    out.weights = density.weights(at)
+    return out
 
 
 def _arrays(tracks: Tracks) -> Iterator[Array]:

@@ -280,8 +280,7 @@ def filtered(
     """Runs the filter of the model that a rule linearises about the filter's own states, or about
     those of a path; `start` replaces the prior, and readings beyond the quantile `gate` are
     missing."""
-    kind = _kind(model, rule, iterations, False, path, gate)
-    return _passed(model, z, kind, path, start)[0]
+    return _passed(model, z, _kind(model, rule, iterations, path, gate), path, start)[0]
 
 
 def smoothed(
@@ -313,7 +312,7 @@ def passed(
     gate: float | None = None,
 ) -> tuple[Tracks, Tracks]:
     """Does the same, for paths that are a beginning: those that have no digits are there, too."""
-    kind = _kind(model, rule, iterations, True, path, gate)
+    kind = _kind(model, rule, iterations, path, gate)._replace(smooths=True)
     tracks, smooth = _passed(model, z, kind, path, start)
     return smooth, tracks
 
@@ -322,12 +321,13 @@ def _kind(
     model: StateModel,
     rule: Rule,
     iterations: int,
-    smooths: bool,
     path: Tracks | None,
     gate: float | None,
 ) -> Kind:
-    tails = tuple(mixture(degrees) for degrees in model.degrees_of_freedom)
-    return Kind(rule, iterations, smooths, path is not None, gate and most_within(gate), tails)
+    """Says which filter is asked for."""
+    tails = tuple(map(mixture, model.degrees_of_freedom))
+    most = gate and most_within(gate)
+    return Kind(rule, iterations, about_path=path is not None, gate=most, tails=tails)
 
 
 def most_within(gate: float) -> float:

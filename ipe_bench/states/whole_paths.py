@@ -20,6 +20,7 @@ from ipe_bench.states.algebra import (
     triangular,
 )
 from ipe_bench.states.base import StateModel
+from ipe_bench.states.passes import kept_of
 from ipe_bench.states.steps import BEYOND
 from ipe_bench.states.student import Tails
 
@@ -76,7 +77,7 @@ class PathDensity:
     z: Array
     """(trials, K, m)"""
     gains: Array
-    """G (K, n, q), with columns of 0 where a step has less noise than others."""
+    """G (K, n, q), of 0 where no transition leads into an epoch."""
     inverses: Array
     """G^+ (K, q, n)."""
     short: bool
@@ -92,13 +93,8 @@ class PathDensity:
 
     @classmethod
     def of(cls, model: StateModel, z: Array) -> PathDensity:
-        epochs = range(model.epochs)
-        still = np.zeros((model.n, 0))
-        own = [model.gain(k) if model.moves(k) else still for k in epochs]
-        most = max(G.shape[1] for G in own)
-        gains = np.zeros((model.epochs, model.n, most))
-        for k, G in enumerate(own):
-            gains[k, :, : G.shape[1]] = G
+        parts = kept_of(model).parts
+        gains = parts.gains
         # G G^+ projects onto the range of the noise.
         inverses = np.linalg.pinv(gains)
         unreached = np.eye(model.n) - np.matmul(gains, inverses)
@@ -107,14 +103,13 @@ class PathDensity:
         there = np.isfinite(z)
         both = there[..., :, None] & there[..., None, :]
         one = np.eye(z.shape[2])
-        R = np.stack([model.R(k) for k in epochs])
-        L = factor(np.where(both, R, one))
+        L = factor(np.where(both, parts.covariances, one))
         whitener = lower_solve(L, np.broadcast_to(one, L.shape))
         tails = Tails.of(model.degrees_of_freedom)
         if tails is not None:
             whitener = whitener / np.sqrt(tails.scale)[:, None]
-        noise = Noise(triangular(model.prior.covariance[None])[0], gains)
-        start = half(model.prior.covariance)
+        noise = Noise(triangular(parts.P[None])[0], gains)
+        start = half(parts.P)
         return cls(model, z, gains, inverses, short, noise, start, whitener, tails)
 
     def subset(self, rows: NDArray[np.intp]) -> PathDensity:
