@@ -72,9 +72,7 @@ def exact_tracks(
         grid = grid_of(model, smooths)
         asked |= grid is not None and _is_little_work(grid, model)
     rows = np.flatnonzero(asked)
-    if not rows.size:
-        return none
-    grid = grid_of(model, smooths)
+    grid = grid_of(model, smooths) if rows.size else None
     if grid is None:
         return none
     tracks = _tracked(replace(grid, gate=gate), model, z[rows])

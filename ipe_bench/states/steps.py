@@ -214,7 +214,7 @@ class Update(NamedTuple):
     told: Rows
     """For a smoother rows (X, Y): the old unit noise is X e, and Y times the new one. Other noise
     is left of it in columns that the root of the states has not."""
-    judged: dict[str, Vector]
+    judged: dict[str, Sequence[Number]]
     """Of readings with tails (m,), which have no L: those `predicted`, the standard `deviation` of
     each innovation, given the readings in front of it the innovation `apart` and `others`, its
     variance with the least noise, and `own`, that of the reading."""
@@ -281,14 +281,14 @@ def _updated_one_by_one(state: State, linear: Linear, M: Rows, readings: Reading
     both = lower(rows)
     x = plus(state.x, X[m : m + n], e)
     F = [row[:n] for row in both[:n]]
-    judged |= {"apart": y, "others": others, "own": [*readings.variances]}
+    judged |= {"apart": y, "others": others, "own": readings.variances}
     told: Rows = []
     if readings.smooths:
         told = beside(X[m + n :], [row[:n] for row in both[n:]])
     return Update(State(x, F), e, unit(m), doubt, told, judged)
 
 
-def _judged_before(y: Vector, rows: Rows, readings: Readings) -> dict[str, Vector]:
+def _judged_before(y: Vector, rows: Rows, readings: Readings) -> dict[str, Sequence[Number]]:
     """Returns the readings with tails that are predicted, and the deviations of innovations y."""
     deviations = []
     for R, tail, row in zip(readings.variances, readings.tails, rows, strict=False):

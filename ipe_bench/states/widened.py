@@ -1,4 +1,11 @@
-"""Covariances of paths of largest density that hold where the density is not normal."""
+"""Covariances of paths of largest density that hold where the density is not normal.
+
+Tangents about such a path give the covariance of a normal density. Whether the density is normal is
+seen from its cost a few deviations away, along each axis of the last states (`_looked_at`). Where
+it is not, the path is moved step by step along the axis on which it differs most (`_followed`): at
+each point the rest of the path is settled anew, and the weighted sum over points takes the place of
+the covariance.
+"""
 
 from __future__ import annotations
 
@@ -178,6 +185,7 @@ def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -
     # Each side by itself: which of them comes first is the sign of an axis, which is round-off.
     owner = np.tile(np.arange(trials), 2)
     sign = np.repeat([1.0, -1.0], trials)
+    # Sums over the points of a side, and the sides that still go on, with their last path.
     moment = np.zeros((2 * trials, *middle.P.shape[1:]))
     total = np.zeros(2 * trials)
     calls = np.zeros(2 * trials)
@@ -186,6 +194,7 @@ def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -
     line = middle.line[owner]
     for number in range(1, _POINTS + 1):
         own = owner[rows]
+        # g' x_K is to be t deviations from where it was; the path comes along as at the last point.
         t = sign[rows] * _STRIDE * number
         some = density.subset(own)
         begun = some.settled(x + sign[rows, None, None] * _STRIDE * line)
@@ -197,6 +206,7 @@ def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -
         over = np.sum(g[own] * last, axis=1) - t
         there = some.settled(begun.x + step - over[:, None, None] * here.line)
         calls[rows] += begun.calls + there.calls + of_tangents
+        # The second moment about the first path, and how much it weighs.
         d = density.model.nearest_state(there.x, at.x[own]) - at.x[own]
         second = here.P + d[..., :, None] * d[..., None, :]
         fall = at.cost[own] - there.cost + middle.size[own] - here.size
@@ -206,6 +216,7 @@ def _followed(density: PathDensity, at: Settled, tangents: Tangents, g: Array) -
         second = np.where(counted[:, None, None, None], second, 0.0)
         total[rows] += weight
         moment[rows] += weight[:, None, None, None] * second
+        # A side ends where the tail behind its point is little.
         going = weight * t**2 > _LITTLE * (1.0 + total[rows])
         if not going.any():
             break
