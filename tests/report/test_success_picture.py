@@ -105,6 +105,7 @@ def test_curves_are_percents_of_trials_and_no_scale_is_cut_off():
     of_all.scales = [0.1, 1.0, 10.0, 100.0, 300.0]
     (ax,) = picture(of_all).axes
     drawn = [line for line in ax.lines if len(line.get_xdata()) == 5]
+    assert [tick.get_text() for tick in ax.get_xticklabels()] == ["0.1", "1", "10", "100"]
     low, high = ax.get_xlim()
     assert all(low <= x <= high for line in drawn for x in line.get_xdata())
     heights = {tuple(np.round(sorted(line.get_ydata())[:2], 9)) for line in drawn}

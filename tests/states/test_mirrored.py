@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from ipe_bench.states import AutoTracker, Formulas
 from ipe_bench.states.copies import SURE
 from ipe_bench.states.damped import Descent
 from ipe_bench.states.linearisation import Taylor
-from ipe_bench.states.mirrored import _ways_round, in_first_turn
+from ipe_bench.states.mirrored import _two, _ways_round, in_first_turn
 from ipe_bench.states.trackers import filtered
 from ipe_bench.states.whole_paths import PathDensity
 from ipe_bench.trials.paths import PathBlock, StateScenario
@@ -235,3 +237,10 @@ def test_a_path_is_moved_to_the_turn_that_the_prior_prefers():
     assert (spent[:2] > 0).all()
     assert (spent[2:] == 0).all()
     assert (tracks.cost <= moved.at.cost).all()
+
+
+def test_paths_are_two_where_a_state_lies_beyond_three_deviations_at_some_time_step():
+    tracks: Any = SimpleNamespace(covariance=np.tile(np.diag([4.0, 0.25]), (3, 5, 1, 1)))
+    d = np.zeros((3, 5, 2))
+    d[0, 2, 0], d[1, 2, 0], d[2, 4, 1] = 5.9, -6.1, 1.6
+    assert _two(tracks, d).tolist() == [False, True, True]
