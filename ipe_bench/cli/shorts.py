@@ -476,7 +476,7 @@ class _Reader:
             readings += f", in the order in which {chosen.name} returns them."
             if "output" in self.columns:
                 readings = f"Readings: column reading of {', '.join(self.files)}; column output"
-                readings += f" tells {enumerate_few(outputs)} apart."
+                readings += f" distinguishes {enumerate_few(outputs)}."
             return self._short(words, [model, readings, self._noise_line(levels)])
         columns = signature.columns
         reading = self._reading_column(signature.text, columns, ["reading"])

@@ -100,7 +100,7 @@ def test_the_starts_are_told_with_those_that_are_typed(words: list[str], said: s
 def test_outputs_below_each_other_are_named_by_the_function() -> None:
     read = shorts.read("estimate", ["named.py", "long.csv"])
     assert "measurement.outputs=['y','x']" in read.words
-    assert "column output tells y, x apart" in read.assumed[1]
+    assert "column output distinguishes y, x" in read.assumed[1]
 
 
 @pytest.mark.parametrize(
