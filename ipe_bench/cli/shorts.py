@@ -37,6 +37,8 @@ _YAML = (".yaml", ".yml")
 _FUNCTION = re.compile(r"(?P<file>.+\.py)(:(?P<name>\w*))?")
 _FORMULA = re.compile(r"[-+*/^()<>]|\bif\b")
 """A sign that a word without a key is a formula, rather than a name."""
+_PATH = re.compile(r".*\.(?![eE]\d)[A-Za-z]\w*")
+"""A path of a file, such as ./my-data.CSV: what no formula ends with."""
 _BARE = re.compile(r"[^\w.:/,=-]")
 """What a shell may read as its own."""
 _BARE_TITLE = re.compile(r"[A-Za-z][\w-]*")
@@ -146,18 +148,23 @@ def _kind(word: str) -> str:
     bare = re.sub("[=<>!]=", "", word)
     if "=" in bare or word.startswith("~") or _FLAG.fullmatch(word):
         return "key"
-    if Path(word).suffix in _DATA:
+    if _is_data(word):
         return "readings"
-    if _FUNCTION.fullmatch(word) or Path(word).suffix in _YAML or _FORMULA.search(word):
+    if _FUNCTION.fullmatch(word) or Path(word).suffix in _YAML:
         return "model"
-    return "key"
+    is_path = _PATH.fullmatch(word) or os.path.lexists(word)
+    return "model" if _FORMULA.search(word) and not is_path else "key"
+
+
+def _is_data(name: str) -> bool:
+    return Path(name).suffix.lower() in _DATA
 
 
 def _files_of_key(word: str) -> list[str]:
     """Returns the files of readings=FILE or readings=[A,B]; none of a number."""
     key, _, value = word.partition("=")
     names = [name.strip("'\"") for name in listed(value)]
-    if key != "readings" or not all(Path(name).suffix in _DATA for name in names):
+    if key != "readings" or not all(map(_is_data, names)):
         return []
     return names
 
@@ -208,13 +215,15 @@ def _require_pair(
 
 def _refuse_no_readings(words: Sequence[str]) -> None:
     """Refuses what stands in the place of a file of readings."""
+    if any(_FLAG.fullmatch(word) for word in words):
+        return
     for word in words:
         if "=" not in word and not word.startswith(("-", "~")):
             if Path(word).suffix.lower() in _SHEETS:
                 raise UserError(
                     f"{word}: cannot be read; save the sheet as CSV, and give that file"
                 )
-            near = did_you_mean(word, [one.name for one in Path().iterdir() if one.suffix in _DATA])
+            near = did_you_mean(word, [one.name for one in Path().iterdir() if _is_data(one.name)])
             raise UserError(f"{word}: is no file of readings ({', '.join(_DATA)}){near}")
 
 
@@ -345,7 +354,7 @@ class _Reader:
         return [name for name in besides if name in self.texts]
 
     def _columns_besides(self, taken: Sequence[str]) -> list[str]:
-        known = {*taken, SIGMA, *self._ignored}
+        known = {*taken, SIGMA}
         return [name for name in self.columns if name not in known]
 
     @property
@@ -361,8 +370,8 @@ class _Reader:
 
     @cached_property
     def columns(self) -> list[str]:
-        """Columns of the first file."""
-        return _columns(self.files[0])
+        """Columns of the first file, besides those left out."""
+        return [name for name in _columns(self.files[0]) if name not in self._ignored]
 
     @cached_property
     def texts(self) -> list[str]:
@@ -440,7 +449,8 @@ class _Reader:
     def _levels(self, read: Sequence[str]) -> list[str]:
         """Returns the words by which each of several columns of readings has a noise level of its
         own, unless noise is stated."""
-        if self._noise_stated or not {SIGMA, f"{SIGMA}_{read[0]}"}.isdisjoint(self.columns):
+        deviations = {SIGMA, *(f"{SIGMA}_{name}" for name in read)}
+        if self._noise_stated or not deviations.isdisjoint(self.columns):
             return []
         return ["noise=unknown", "noise.by=output"]
 
@@ -509,6 +519,12 @@ class _Reader:
         absent = [column for column in signature.columns if column not in self.columns]
         if not absent:
             return
+        left_out = [column for column in absent if column in self._ignored]
+        if left_out:
+            raise UserError(
+                f"ignore_columns: leaves out {enumerate_few(left_out)}, which {signature.text}"
+                f" takes; keep it, or make it a parameter by measurement.start.{left_out[0]}=1"
+            )
         left = self._columns_left([*signature.columns, "reading"])
         near = did_you_mean(absent[0], left)
         words = [f"measurement.start.{name}=1" for name in absent]
@@ -638,7 +654,7 @@ class _Reader:
 
     def _refuse_other_reading(self, reading: str, names: Sequence[str]) -> None:
         """Refuses a formula whose readings are no column, or one that is used otherwise."""
-        if reading not in self.columns:
+        if reading not in [*self.columns, *self._ignored]:
             _refuse_absent(self.model, self.files[0], reading)
         (typed,) = self._last_value("measurement.reading") or [reading]
         use = ""
@@ -719,7 +735,7 @@ class _Reader:
         typed = self._last_value("state_model.inputs.time") or self._last_value("state_model.step")
         told = typed or "step" in content or "time" in content.get("inputs", {})
         clock = {"t", "dt"} & set(_names(content)) - _defined(content)
-        return bool(clock) and "time" in {*self.columns} - {*self._ignored} and not told
+        return bool(clock) and "time" in self.columns and not told
 
     def _require_complete(self, file: str, content: dict[str, Any], group: str, cls: type) -> None:
         """Refuses a file with keys that mean nothing, or without those that are needed."""
@@ -732,7 +748,11 @@ class _Reader:
             near = [name for name in options if name[:_ALIKE] == key[:_ALIKE]]
             said.append(f"{key} means nothing{f' (did you mean {near[0]}?)' if near else ''}")
         misnamed = bool(said)
-        typed = {".".join(re.split(r"[.=]", word)[1:2]) for word in self.others}
+        typed = {
+            re.split("[.=]", word)[1]
+            for word in self.others
+            if word.lstrip("+").startswith((f"{group}.", f"{group}="))
+        }
         words = []
         for name, one in options.items():
             given = name in content or name in typed
@@ -862,7 +882,7 @@ def _starts_phrase(starts: dict[str, str]) -> str:
 
 def _parsed(file: str) -> ast.Module:
     try:
-        return ast.parse(Path(file).read_text(encoding="utf-8"), file)
+        return ast.parse(Path(file).read_text(encoding="utf-8-sig"), file)
     except SyntaxError as error:
         raise UserError(f"{place_of(error)}; correct the file") from None
     except ValueError:

@@ -251,7 +251,7 @@ def _read_table(path: Path, most: int | None = None) -> TextTable:
         raise TextTable(path).error(fault)
     data = path.read_bytes()
     table = TextTable(path, digest=hashlib.sha256(data).hexdigest())
-    table = (_with_parquet if path.suffix == ".parquet" else _with_text)(table, data, most)
+    table = (_with_parquet if path.suffix.lower() == ".parquet" else _with_text)(table, data, most)
     _require_header(table)
     for number, row in table.rows:
         if len(row) != len(table.heading):

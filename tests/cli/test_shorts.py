@@ -66,6 +66,9 @@ FILES = {
     "volt.csv": "t [s],volt [V]\n0,1\n1,2\n2,3.5\n",
     "circle.csv": "x,y,reading\n1,2,0\n3,4,0\n",
     "log.csv": "z\n1\n2\n3\n",
+    "marked.py": "\ufeffdef law(time, k=1.0):\n    return k * time\n",
+    "my-data.CSV": "t,reading\n1,2\n2,3\n3,4\n",
+    "half.csv": "time,x,y,sigma_y\n1,1.1,1.6,1\n2,1.2,1.3,1\n3,1.3,1.1,1\n",
 }
 
 
@@ -77,7 +80,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     FILES["line.csv"] = "\n".join(["t,y", *rows]) + "\n"
     FILES["falling.csv"] = "\n".join(["t,reading", *rows]) + "\n"
     for name, text in FILES.items():
-        (tmp_path / name).write_text(text)
+        (tmp_path / name).write_text(text, encoding="utf-8")
     (tmp_path / "folder.csv").mkdir()
     (tmp_path / "folder.yaml").mkdir()
     return tmp_path
@@ -163,6 +166,7 @@ def test_outputs_below_each_other_are_named_by_the_function() -> None:
                 ("pair.csv", [], " noise=unknown noise.by=output"),
                 ("pair.csv", ["noise.deviation=1"], " noise.deviation=1"),
                 ("weighed.csv", [], ""),
+                ("half.csv", [], ""),
                 ("alone.csv", [], ""),
             ]
         ),
@@ -175,6 +179,20 @@ def test_outputs_below_each_other_are_named_by_the_function() -> None:
             for file, read in {"many.py": "['x','y']", "named.py": "['y','x']"}.items()
         ),
         (["measurement=ranging", "my.csv"], "measurement=ranging readings='my.csv'"),
+        (
+            ["volt*t", "warm.csv", "measurement.start.volt=2", "ignore_columns=[volt]"],
+            "measurement=formula measurement.expression='volt*t' measurement.reading='temp'"
+            " measurement.start.volt=2 ignore_columns=[volt] readings='warm.csv'",
+        ),
+        (
+            ["marked.py", "weighed.csv", "ignore_columns=[x]"],
+            "measurement=function measurement.of=marked:law measurement.reading='y'"
+            " ignore_columns=[x] readings='weighed.csv'",
+        ),
+        (
+            ["falling.py", "my-data.CSV"],
+            "measurement=function measurement.of=falling:height readings='my-data.CSV'",
+        ),
         (
             ["y ~ a*t", "line.csv"],
             "measurement=formula measurement.expression='a*t' measurement.start.a=1"
@@ -260,6 +278,12 @@ def test_a_short_form_is_that_long_form(words: list[str], full: str, folder: Pat
             ["a*t+b", "line.cvs"],
             "line.cvs: is no file of readings (.csv, .tsv, .txt, .dat, .parquet",
         ),
+        (["falling.py", "./my-data.xlsx"], "./my-data.xlsx: cannot be read; save the sheet as CSV"),
+        (["falling.py", "my-data.csv.gz"], "my-data.csv.gz: is no file of readings (.csv"),
+        (["./my-data.xlsx", "line.csv"], "./my-data.xlsx: is no model; write a function's file"),
+        (["free.py", "line.csv", "ignore_columns=[t]"], "leaves out t, which fall(t, h, v) takes;"),
+        (["bare.yaml", "log.csv", "output=noise"], "w is not defined; add each"),
+        (["bare.yaml", "log.csv", "noise.deviation=1"], "deviation is missing; spread is missing"),
         (["f(t) = a*t+b", "line.csv"], 'write the formula alone, "a*t+b", or behind the name'),
         (["timed.py", "falling.csv"], "the argument t of f(t, a) has a default, which makes it"),
         (
