@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.machine import library_versions
@@ -17,8 +18,8 @@ from ipe_bench.states.base import StateModel
 
 
 def estimate_command(arguments: Sequence[str]) -> int:
-    """Estimates with every chosen estimator, prints tables and writes files; returns 1 if no fit
-    passes."""
+    """Estimates with every chosen estimator, prints tables and writes files; returns 1 unless every
+    answer passes."""
     asked = single(
         "estimate", arguments, standard_words(arguments), run=(*of("run", "trials"), w.TRUTH)
     )
@@ -27,16 +28,12 @@ def estimate_command(arguments: Sequence[str]) -> int:
     from ipe_bench.report.page import answer as page
 
     question = asked.spec.question(asked.words.keys).checked()
-    files = question.readings
-    readings = [str(path.resolve()) for path in files] if isinstance(files, tuple) else None
-    command: dict[str, Any] = {  # what was asked for, not what the file holds today
-        "readings": readings,
+    command = {
+        **_of_files(asked),
         "scenario": describe(question.scenario),
         "prior": question.has_prior,
         "estimators": asked.estimators,
     }
-    if question.ignored:
-        command["left_out"] = list(question.ignored)
     parts = [question.scenario, *question.estimators.values()]
     provenance = _provenance(asked, question.found.files, parts)
 
@@ -54,24 +51,35 @@ def standard_words(arguments: Sequence[str]) -> list[str]:
 
 
 def _track(asked: Single, model: StateModel) -> int:
-    """Tracks the states by every chosen tracker; exit code 1 where no track passes."""
+    """Tracks the states by every chosen tracker; exit code 1 unless every track passes."""
     from ipe_bench.report.page import log as page
 
-    spec = asked.spec
-    find = spec.find or ()
-    question = asked.log_question(spec.readings, find)
-    command: dict[str, Any] = {
-        "readings": spec.readings,
-        "find": find,
+    question = asked.log_question(asked.spec.readings, asked.spec.find or ())
+    command = {
+        **_of_files(asked),
+        "find": list(question.find),
         "model": describe(model),
         "trackers": asked.estimators,
     }
-    if spec.gate is not None:
-        command["gate"] = spec.gate
     files = [log.file for log in question.logs if log.file]
     parts = [log.model for log in question.logs]
     provenance = _provenance(asked, files, [*parts, *question.trackers.values()])
     return _answered(asked, page, command, provenance, lambda: page.LogAnswer.to(question, "lines"))
+
+
+def _of_files(asked: Single) -> dict[str, Any]:
+    """Returns what a command asks of its files, by which it is told from others: not what the files
+    hold today."""
+    spec = asked.spec
+    given = spec.readings
+    names = [given] if isinstance(given, str) else given
+    files = None if names is None else [str(Path(name).resolve()) for name in names]
+    of_files: dict[str, Any] = {"readings": files}
+    if spec.ignored:
+        of_files["left_out"] = list(spec.ignored)
+    if spec.gate is not None:
+        of_files["gate"] = spec.gate
+    return of_files
 
 
 def _answered(

@@ -13,6 +13,7 @@ import pytest
 
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
+from ipe_bench.cli.questions import question
 from ipe_bench.plugins import standard
 from ipe_bench.questions.own.answer import (
     advice,
@@ -26,6 +27,7 @@ from ipe_bench.questions.own.answer import (
 from ipe_bench.questions.own.levels import by_levels
 from ipe_bench.questions.own.maths import Claim, Own, Point, _claims, _Truth, own
 from ipe_bench.questions.own.tracks import own_log
+from ipe_bench.questions.question import Asked
 from ipe_bench.real.estimation import Question
 from ipe_bench.real.logs import Log
 from ipe_bench.statistics.intervals import clopper_pearson
@@ -45,6 +47,22 @@ def line(noise: Any = None, **stated: Any) -> Question:
     """Six readings: with four degrees of freedom the law of the level counts."""
     z = 3.0 + 0.5 * T[:6] + 0.2 * np.random.default_rng(3).standard_normal(6)
     return asked("a*t + b", {"a": 1.0, "b": 1.0}, z, noise=noise, **stated)
+
+
+@pytest.mark.parametrize("name", ["design", "posterior"])
+def test_every_option_of_a_question_tells_its_commands_apart(name: str) -> None:
+    """Else two answers would share a folder."""
+    told = {}
+
+    def folder(name: str, identity: dict[str, Any], files: Any) -> Any:
+        told.update(identity)
+        raise UserError("enough")
+
+    scenario = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(1.0))
+    asked = Asked("line", scenario, LEAST_SQUARES, None, folder)
+    with pytest.raises(UserError, match="enough"):
+        question(name).run(asked)
+    assert told.keys() >= question(name).options().keys()
 
 
 @pytest.mark.parametrize("noise", [None, ib.noise.Gaussian(0.2)])

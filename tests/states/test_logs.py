@@ -553,6 +553,25 @@ def test_each_of_several_logs_has_its_track_and_page(ipe_bench, tmp_path):
     assert alone.split("last time step")[1].split()[4:8] == states[2]
 
 
+def test_the_folder_of_an_estimate_is_kept_for_its_files_and_what_is_left_out(
+    ipe_bench, tmp_path, monkeypatch
+):
+    (tmp_path / "a.csv").write_text("z,remark\n1,x\n2,y\n3,z\n")
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "a.csv").write_text("z\n7\n8\n9\n")
+    model = "next.x=x+w readings.z=x noise.w=1 deviation.z=1 spread.x=5"
+    given = [f"state_model.{word}" for word in model.split()]
+    words = ["state_model=formulas", *given, "tracker=[ekf]", "readings=a.csv", "figures=none"]
+    words.append(f"output={tmp_path / 'out'}")
+    for _ in range(2):  # the same command has its folder again
+        assert ipe_bench("estimate", *words, "ignore_columns=[remark]")[0] == 0
+    (tmp_path / "a.csv").write_text("z\n1\n2\n3\n")
+    for folder in (tmp_path, tmp_path / "below"):
+        monkeypatch.chdir(folder)
+        code, _, err = ipe_bench("estimate", *words)
+        assert (code, "contains results of another command" in err) == (2, True)
+
+
 def test_status_says_what_a_folder_of_an_estimate_has(ipe_bench, tmp_path):
     (tmp_path / "a.csv").write_text("z\n1\n2\n3\n")
     model = "next.x=x+w readings.z=x noise.w=1 deviation.z=1 spread.x=5"

@@ -44,16 +44,15 @@ def answer(asked: Asked, at: str | None = None, **given: Any) -> Answered:
         raise UserError("noise=certified: design plans future readings; choose another noise")
     errors = richer_models(scenario)
     point = None if at is None else _estimates(at)
+    chosen = {"by": None, "readings": None, "criterion": "A", **given}
     identity = {
         "scenario": describe(dataclasses.replace(scenario, truth=None)),
         "errors": [describe(error) for error in errors],
         "at": point,
-        "by": given.get("by"),
-        "readings": given.get("readings"),
-        "criterion": given.get("criterion", "A"),
+        **chosen,
     }
     with asked.folder("design", identity, (READINGS,)) as folder:
-        found = designed(scenario, errors=errors, at=point, **given)
+        found = designed(scenario, errors=errors, at=point, **chosen)
         found = dataclasses.replace(found, about_estimate=asked.about_estimate)
         files = write_design(folder, asked.title, found)
     code = 0 if found.observability.observable else 1
@@ -69,15 +68,15 @@ def _estimates(folder: str) -> dict[str, float]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         examined = content["examination"]
-        fixed = content["fixed"]
+        estimates = None if examined is None else {**content["fixed"], **examined["estimates"]}
     except (OSError, ValueError, KeyError, TypeError):
         raise UserError(
             f"at={folder}: has no {NAME}.json of an answer; give a folder that `ipe-bench estimate`"
             " wrote to"
         ) from None
-    if examined is None:
+    if estimates is None:
         raise UserError(f"at={folder}: no estimate there passes; design at the start, without at=")
-    return {**fixed, **examined["estimates"]}
+    return estimates
 
 
 def options() -> Mapping[str, Any]:

@@ -529,9 +529,12 @@ def test_a_folder_without_an_estimate_is_refused(ipe_bench):
     Path("failed/estimate.json").write_text('{"examination": null, "fixed": {}}')
     Path("other").mkdir()
     Path("other/estimate.json").write_text("[]")
+    Path("null").mkdir()
+    Path("null/estimate.json").write_text('{"examination": {"estimates": {}}, "fixed": null}')
     for folder, why in {
         "nowhere": "has no estimate.json of an answer; give a folder that `ipe-bench estimate`",
         "other": "has no estimate.json of an answer; give a folder that `ipe-bench estimate`",
+        "null": "has no estimate.json of an answer; give a folder that `ipe-bench estimate`",
         "failed": "no estimate there passes; design at the start, without at=",
     }.items():
         done, _, err = ipe_bench(*asked, f"at={folder}")
