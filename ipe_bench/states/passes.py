@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, multiply, own
+from ipe_bench.basics.linalg import Array, Mask, multiply, own
 from ipe_bench.engine.rows import RowFunction
 from ipe_bench.engine.scan import Step, gram
 from ipe_bench.engine.trace import RowPrograms
@@ -129,6 +129,13 @@ class StepLayouts:
         if self.has_tails:
             diagnostics |= {"apart": self.m, "others": self.m, "own": self.m}
         return Layout(**parts, nis=1, **diagnostics)
+
+    def gated(self, z: Array, output: Array) -> Mask:
+        """Tells which readings z (..., m) a filter took for missing, by its output (..., o): those
+        without a prediction. A trial that has broken down has none, either."""
+        layout = self.filter_output
+        unseen = np.isnan(layout.part(output, "predicted"))
+        return np.isfinite(z) & unseen & np.isfinite(layout.part(output, "nis"))
 
     @cached_property
     def smoother_carry(self) -> Layout:
@@ -681,8 +688,7 @@ class _PassesByEpoch(Passes):
             at = self._states_of(carry)
             if gate is not None:
                 # What the first linearisation takes for missing is missing to all.
-                predicted = self.layouts.filter_output.part(output, "predicted")
-                z = np.where(np.isfinite(predicted), z, np.nan)
+                z = np.where(self.layouts.gated(z, output), np.nan, z)
                 gate = None
 
     def _noise(self, k: int, at: _TrialStates) -> Array:

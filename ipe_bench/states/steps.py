@@ -196,8 +196,9 @@ class Readings(NamedTuple):
         for reading, a, noise, slopes in zip(self.z, y, M, linear.AF, strict=True):
             apart = reading - a
             variance = dot(noise, noise, dot(slopes, slopes))
-            inside = np.less_equal(apart * apart, most * variance)
-            kept.append(np.where(inside, reading, np.nan))
+            # What is not a number lies beyond nothing: h has no value there, and the trial is lost.
+            beyond = np.less(most * variance, apart * apart)
+            kept.append(np.where(beyond, np.nan, reading))
         return self._replace(z=kept)
 
 

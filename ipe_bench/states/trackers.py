@@ -382,13 +382,12 @@ def _found(passes: Passes, found: Passed, z: Array, start: Normal) -> tuple[Trac
     layout = passes.layouts.filter_output
     n = passes.layouts.n
     after = found.filtered[:, 1:]
-    predicted = layout.part(after, "predicted")
-    given = np.isfinite(z)
     # A reading beyond the gate is missing, and has no innovation.
-    gated = given & np.isnan(predicted) & np.isfinite(layout.part(after, "nis"))
-    seen = given & ~gated
+    gated = passes.layouts.gated(z, after)
+    seen = np.isfinite(z) & ~gated
     carry = passes.layouts.filter_carry
     log_likelihood = carry.part(found.carry, "log_likelihood")[:, 0].copy()
+    # A doubt that is not a number is of states that are not, either.
     lost = carry.part(found.carry, "doubt")[:, 0] > BEYOND
     tracks = Tracks(
         mean=layout.part(after, "x"),
@@ -399,7 +398,7 @@ def _found(passes: Passes, found: Passed, z: Array, start: Normal) -> tuple[Trac
         log_likelihood=log_likelihood,
         calls=np.zeros(len(z)),
         start=start,
-        predicted=predicted,
+        predicted=layout.part(after, "predicted"),
         predicted_deviation=layout.part(after, "deviation"),
         root=layout.part(found.filtered, "F"),
         gated=None if passes.kind.gate is None else gated,
@@ -438,7 +437,9 @@ def _judge(tracks: Tracks, layout: Layout, after: Array, tails: Sequence[Mixture
         expected = evidence(0.0 * apart[..., j], *given[1:], one)
         share = (1 / expected.gain - states) / (1 / found.gain - states)
         weights[..., j] = np.where(here, share, np.nan)
-    tracks.nis = np.nansum(tracks.innovations**2, axis=2)
+    squares = np.nansum(tracks.innovations**2, axis=2)
+    # A trial that has broken down has no innovations, which are 0 only of missing readings.
+    tracks.nis = np.where(np.isnan(tracks.nis), np.nan, squares)
     tracks.log_likelihood = likelihood
     tracks.weights = weights
 

@@ -127,6 +127,16 @@ def test_what_lies_beyond_the_gate_is_missing(model, name):
             np.testing.assert_array_equal(getattr(tracks, part)[1:2], getattr(alone, part))
 
 
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_reading_without_a_value_loses_the_trial_and_lies_beyond_no_gate(name):
+    """The logarithm has no value at the prior's mean of -0.1, whatever was read."""
+    model = replace(LEVEL, readings={"z": "log(x)"}, start={"x": -0.1}, spread={"x": 0.01}, count=3)
+    for form in (model, model.by_epoch()):
+        tracks = FILTERS[name].gated(GATE).track(form, np.zeros((1, 3, 1)))
+        assert np.isnan(tracks.mean).all()
+        assert not tracks.gated.any()
+
+
 def test_a_path_is_that_of_the_readings_that_its_first_filter_takes():
     z = spiked(LEVEL)
     tracks = IteratedSmoother().gated(GATE).track(LEVEL, z)

@@ -248,6 +248,13 @@ def test_functions_that_are_called_epoch_by_epoch_have_the_same_tracks(tracker):
     np.testing.assert_allclose(one.weights[0, :, 0], 1.0)
 
 
+def test_a_trial_that_breaks_down_fits_no_better_than_one_of_normal_readings():
+    """The logarithm has no value at the prior's mean of -0.1."""
+    for model in (LEVEL, NORMAL):
+        lost = replace(model, readings={"z": "log(x)"}, start={"x": -0.1}, count=3)
+        assert np.isnan(ekf().track(lost, np.zeros((1, 3, 1))).nis).all()
+
+
 def test_a_bound_counts_readings_by_their_information():
     """That of t by quadrature of its squared score: it is 1.43 times that of a normal reading."""
     information = quad(
