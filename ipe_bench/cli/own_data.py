@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.spec import Spec
 from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.known import ConstrainedModel
-from ipe_bench.noise import Gaussian
+from ipe_bench.noise import Colored, Correlated, Gaussian
 from ipe_bench.noise.base import Noise
 from ipe_bench.plugins import standard
 from ipe_bench.questions.own.maths import require_answer
@@ -31,9 +32,24 @@ def question_on(spec: Spec, files: Sequence[str], stated: Collection[str]) -> Qu
     return asked.question(stated).checked()
 
 
-def noise_of(fit: Fit) -> Gaussian:
-    """Returns normal noise of the level that was stated or is estimated."""
-    deviations = fit.assumed.R.deviations
+def noise_of(fit: Fit) -> Noise:
+    """Returns the noise that was stated, or normal noise of the level that is estimated, of the
+    readings that are present.
+
+    Raises:
+        UserError: readings are missing among correlated errors.
+    """
+    noise = fit.given.noise
+    R = fit.assumed.R
+    if not noise.estimated and not isinstance(noise, Gaussian):
+        correlated = isinstance(noise, Colored | Correlated) or R.factor.ndim > 1
+        if correlated and len(fit.given.rows) < fit.given.model.m:
+            raise UserError(
+                f"noise={noise.name}: is correlated, and readings are missing, which is not"
+                " simulated; remove their rows, or choose another noise"
+            )
+        return noise
+    deviations = R.deviations
     if np.ptp(deviations) == 0.0:
         return Gaussian(float(deviations[0]))
     return Gaussian(tuple(deviations.tolist()))
@@ -57,14 +73,13 @@ def like_these(
         model = model.whole
     if len(fit.given.rows) < model.m:
         model = SubsetModel(model, tuple(fit.given.rows.tolist()))
-    noise: Noise = noise_of(fit)
-    source = "as stated"
+    noise = noise_of(fit)
+    law = "normal" if isinstance(noise, Gaussian) else noise.name
+    lines = []
     if fit.given.noise.estimated:
-        source = "as estimated from the readings"
-    lines = [f"Noise: normal, {_level(fit)}, {source}."]
-    if "noise" in stated and not fit.given.noise.estimated:
-        noise = spec.noise
-        lines = []
+        lines.append(f"Noise: {law}, {_level(fit)}, as estimated from the readings.")
+    elif "noise" not in stated:
+        lines.append(f"Noise: {law}, {_level(fit)}, as stated.")
     scale = spec.error_scale
     known = dict(spec.parameters or {})
     if not at_estimate:
@@ -76,7 +91,8 @@ def like_these(
     if "error_scale" not in stated:
         scale = NEAR
     names = [p.name for p in fit.given.model.physical_parameters]
-    found = dict(zip(names, fit.x.tolist(), strict=False))
+    # Several levels of the noise stand behind the parameters.
+    found = dict(zip(names, fit.x[: len(names)].tolist(), strict=True))
     for name, value in found.items():
         known[name] = {**known.get(name, {}), "nominal": value}
     values = ", ".join(f"{name} = {value:.4g}" for name, value in found.items())
