@@ -2,7 +2,7 @@
 
 A plugin is a Python package with a `conf` folder inside that mirrors the groups of ours. Installed
 plugins state the package in the entry-point group `ipe_bench.plugins`; a plugin in a folder needs
-nothing but to be there.
+only its package with an `__init__.py`.
 """
 
 from __future__ import annotations
@@ -323,11 +323,16 @@ def installed_sources() -> list[Source]:
 
 def _in_folder(folder: Path) -> Iterator[Source]:
     for conf in sorted(folder.resolve().glob("*/conf")):
-        if (conf.parent / "__init__.py").is_file():
-            name = conf.parent.name
-            packages.add(name)
-            origin = f"{folder.parent.name}/{folder.name}"
-            yield Source(name, conf, origin, _stated_name(folder))
+        home = conf.parent
+        if not (home / "__init__.py").is_file():
+            if any((conf / group).is_dir() for group in CHECKED_GROUPS):
+                _problems[f"plugin {home}: has no __init__.py; it is left out, add one"] = None
+            continue
+        for path in sorted(conf.glob("*/**/*.yml")):
+            _problems[f"{path}: is not read; name it {path.stem}.yaml"] = None
+        packages.add(home.name)
+        origin = f"{folder.parent.name}/{folder.name}"
+        yield Source(home.name, conf, origin, _stated_name(folder))
 
 
 def _stated_name(folder: Path) -> str | None:
@@ -377,9 +382,23 @@ def kinds_to_copy() -> dict[str, Path]:
 def composed(option: Option) -> dict[str, Any]:
     """Composes an option with the options of its group that its `defaults` name, as Hydra does:
     later ones replace what earlier ones say, and the file itself comes last unless `_self_` stands
-    elsewhere."""
-    config = dict(option.config or {})
-    entries = [str(entry) for entry in config.pop("defaults", [])]
+    elsewhere.
+
+    Raises:
+        UserError: a file cannot be used, or `defaults` names no option, or one that names this one.
+    """
+    return _composed(option, ())
+
+
+def _composed(option: Option, above: tuple[Path, ...]) -> dict[str, Any]:
+    """Composes an option that the files `above` it name."""
+    if option.path in above:
+        raise UserError(f"{option.path}: defaults: names itself, or a file that names it")
+    config = dict(_mapping(option))
+    given = config.pop("defaults", None) or []
+    if not isinstance(given, list):
+        raise UserError(f"{option.path}: defaults: is no list; write defaults: [{given}]")
+    entries = [str(entry) for entry in given]
     known = {o.name: o for o in options(option.group)} if entries else {}
     found: dict[str, Any] = {}
     for entry in entries if "_self_" in entries else [*entries, "_self_"]:
@@ -388,8 +407,20 @@ def composed(option: Option) -> dict[str, Any]:
             raise UserError(
                 f"{option.path}: defaults: {unknown(name, known, f'option of {option.group}')}"
             )
-        found = merged(found, config if entry == "_self_" else composed(known[name]))
+        other = config if entry == "_self_" else _composed(known[name], (*above, option.path))
+        found = merged(found, other)
     return found
+
+
+def _mapping(option: Option) -> Mapping[str, Any]:
+    """Returns the keys of an option's file; none of an empty one."""
+    try:
+        config = option.config or {}
+    except yaml.YAMLError as error:
+        raise UserError(explain_yaml(error, option.path)) from None
+    if not isinstance(config, Mapping):
+        raise UserError(f"{option.path}: has no keys; write KEY: VALUE lines")
+    return config
 
 
 def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:

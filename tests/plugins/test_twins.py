@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery
 
@@ -101,3 +102,58 @@ def test_a_copy_that_was_imported_already_goes_on(site, monkeypatch):
     )
     assert "is called ipe_bench_twin too; it is left out" in done.stderr
     assert "\nsolver, from IPE_bench.twin 0.1.0\n" in done.stdout
+
+
+def written(home: Path, **files: str) -> list[discovery.Option]:
+    """Writes options of noise of a plugin in a folder, and finds them."""
+    package = home / "mine"
+    (package / "conf" / "noise").mkdir(parents=True)
+    (package / "__init__.py").touch()
+    for name, text in files.items():
+        (package / "conf" / "noise" / f"{name}.yaml").write_text(text)
+    return discovery.options_in(home)
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({"a": "defaults: [b]\n", "b": "defaults: [a]\n"}, "names itself, or a file that names it"),
+        ({"a": "defaults: [a]\n"}, "names itself, or a file that names it"),
+        ({"a": "defaults: [b]\n", "b": "x: [1\n"}, "b.yaml, line 2: is not YAML that can be read"),
+        ({"a": "defaults: [b]\n", "b": "7\n"}, "b.yaml: has no keys"),
+        ({"a": "defaults: 7\n"}, "a.yaml: defaults: is no list"),
+    ],
+)
+def test_defaults_that_cannot_be_composed_are_refused_in_a_line(
+    files: dict[str, str], said: str, tmp_path: Path
+) -> None:
+    with discovery.added_for_now():
+        first = written(tmp_path / "one", **files)[0]
+        with pytest.raises(UserError) as error:
+            discovery.composed(first)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_empty_defaults_are_none(tmp_path: Path) -> None:
+    with discovery.added_for_now():
+        (option,) = written(tmp_path / "one", a="defaults:\nx: 1\n")
+        assert discovery.composed(option) == {"x": 1}
+
+
+def test_what_of_a_plugin_in_a_folder_is_passed_over_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    noises = [tmp_path / "plugins" / name / "its" / "conf" / "noise" for name in ("one", "two")]
+    for noise in noises:
+        noise.mkdir(parents=True)
+        (noise / "a.yml").write_text("x: 1\n")
+    (noises[1].parents[1] / "__init__.py").touch()
+    discovery.sources.cache_clear()
+    said = discovery.take_problems()
+    discovery.sources.cache_clear()
+    assert [line.partition("plugins/")[2] for line in said] == [
+        "one/its: has no __init__.py; it is left out, add one",
+        "two/its/conf/noise/a.yml: is not read; name it a.yaml",
+    ]
