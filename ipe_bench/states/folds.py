@@ -66,7 +66,7 @@ def exact_tracks(
         return none
     asked = folded(model, filtered)
     if Filter().hindrance(model):
-        # A filter takes nothing from such readings.
+        # The state changes their noise, not their mean: a filter takes nothing from them.
         asked[:] = True
     if of_all and not straight(model, filtered):
         grid = grid_of(model, smooths)
@@ -110,6 +110,8 @@ def folded(model: StateModel, filtered: Tracks) -> Mask:
     unlike = deviation.max(axis=0) > _NOISES * least
     h, slopes = _readings(model, x)
     rise = model.nearest(h[1:], h[:-1]) - h[:-1]
+    # A reading without a value at one of the states counts as even. Nothing is lost by that: a grid
+    # reaches further, and has no answer for a model whose readings have no value at some points.
     misleading = _is_bent(rise, least) | unlike
     if slopes is not None:
         misleading |= _comes_round(model, slopes, x[-1] - x[0])

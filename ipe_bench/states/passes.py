@@ -1,12 +1,24 @@
 """Runs Gaussian filters and smoothers along a model's epochs.
 
-A pass takes all trials forward through the epochs with a filter, and for a smoother back again. If
-f and h are recorded, each epoch is one program of machine code that contains them
-(`_RecordedPasses`); if not, or if that program would be long, f and h are called and linearised in
-NumPy, and machine code takes their values and slopes as numbers (`_PassesByEpoch`). A step is
-written once, as a function of lists: the parts of its *carry*, which goes from epoch to epoch, and
-of its *output*, which is stored at each, lie in rows of numbers as `StepLayouts` says. A trial that
-breaks down is NaN from then on and disturbs no other.
+A pass takes all trials forward through the epochs with a filter, and for a smoother back again. Its
+*kind* says which filter that is (`Kind`): the rule that linearises, iterations, gate and tails. A
+step is written once, as a function of lists: the parts of its *carry*, which goes from epoch to
+epoch, and of its *output*, which is stored at each, lie in rows of numbers whose *layouts* say
+where (`StepLayouts`). A trial that breaks down is NaN from then on and disturbs no other.
+
+There are two forms, which share the algebra of `steps`, the outputs (`_filter_output`) and the way
+back of a smoother, and repeat what lies around:
+
+                        recorded: _RecordedStep           by epoch: _PassesByEpoch
+    for which models    f and h are recorded, and their   all others, such as those whose noise
+                        program is not long               depends on the states
+    f and h             in the machine code of a step     called in NumPy; a step takes numbers
+    linearised by       `Law`, of one trial in lists      `Rule.linearised`, of all in arrays
+    epochs              stretches that share a step       one after another
+    iterations          _update                           _update
+    gate                _update                           _update_step, and _update for iterations
+    about a path        step, _predict, _update           _predict, _update
+    least noise         _update                           _least_root
 """
 
 from __future__ import annotations
@@ -235,7 +247,8 @@ class _RecordedStep:
 
     def compiled(self) -> Step:
         layouts = self.layouts
-        # A rule of a plugin may get other points by the same name: the numbers tell.
+        # Machine code is kept on disk, where a rule is its name: another day that of a plugin may
+        # have other points, and the numbers tell.
         identity = (self, numbers_of(self.kind.rule, layouts.n))
         carry, output = layouts.filter_carry, layouts.filter_output
         return named_step(self.step, identity, carry, [self.each], self.shared, output)
@@ -368,7 +381,8 @@ def _filter_output(
     z: Vector, update: Update, log_likelihood: Vector, doubt: Vector
 ) -> dict[str, Any]:
     """Names what a filter carries on from an update and stores of it."""
-    state, e, L, doubt_here, update_rows, judged = update
+    state, e, L, doubt_here, update_rows, by_mixture = update
+    # Of readings with tails these are no scores: `trackers` scores their mixtures instead.
     nis, log_density = scores(e, L)
     return {
         **state._asdict(),
@@ -381,7 +395,7 @@ def _filter_output(
         "deviation": [np.sqrt(dot(row, row)) for row in L],
         "covariance": gram(state.F),
         # Readings with tails have no L: these replace what is predicted by it.
-        **judged,
+        **by_mixture,
     }
 
 
@@ -396,7 +410,7 @@ class Passed(NamedTuple):
     """Holds what the passes of some trials found, in rows of `StepLayouts`."""
 
     filtered: Array
-    """Outputs of the filter (trials, 1 + K, o), the prior in front."""
+    """Outputs of the filter (trials, 1 + K, o); in front x and F of the prior, and else 0."""
     carry: Array
     """That of the filter after the last epoch (trials, c)."""
     smoothed: Array | None
@@ -446,6 +460,7 @@ class Passes(ABC):
         mean, root = self.prior if start is None else (start.mean, roots(start.covariance))
         carry = np.zeros((trials, layouts.filter_carry.size))
         output = np.empty((trials, 1 + K, layouts.filter_output.size))
+        # Of the row in front a smoother reads x and F; nothing reads the rest.
         output[:, 0] = 0.0
         for rows, layout in ((carry, layouts.filter_carry), (output[:, 0], layouts.filter_output)):
             rows[:, layout.at["x"]] = mean
@@ -529,6 +544,7 @@ class _RecordedPasses(Passes):
         first = int(epochs[0])
         f, f_numbers = _recording_at(self.functions[0], epochs, model.epochs)
         h, h_numbers = _recording_at(self.functions[1], epochs, model.epochs)
+        # All epochs or none: one into which states stand still has a recording of its own for f.
         moves = model.moves(first)
         recorded = _RecordedStep.of(self, _programs(f) if moves else None, _programs(h), noise)
         values = {"d": h_numbers, "R": noise.R[epochs]}
@@ -617,12 +633,15 @@ class _PassesByEpoch(Passes):
     def forward(self, z: Array, route: Route | None, carry: Array, output: Array) -> None:
         n = self.layouts.n
         at = self.layouts.smoother_input.at
+        # The rows (X, Y) lie side by side, in the output as in `transition_rows`: the step of an
+        # update fills in those of no transition, and that of a transition is put in their place.
         of_transition = slice(at["transition_X"].start, at["transition_Y"].stop)
         # States that stand still keep their unit noise: X = I and Y = 0.
         still = np.concatenate([np.eye(n).ravel(), np.zeros(n * (n + 1) // 2)])
         for k in range(self.model.epochs):
             rows = still
             before = here = None
+            # Row k of a route is the state before epoch k, since the start is in front.
             if route is not None:
                 before = self._states(route.mean[:, k], route.root[:, k])
                 here = self._states(route.mean[:, k + 1], route.root[:, k + 1])
@@ -648,13 +667,13 @@ class _PassesByEpoch(Passes):
         state = self._states_of(carry)
         at = before or state
         nearest = model.nearest_state if model.state_periods else None
-        law = rule.linearised(model.transition_into(k), at.x, at.F, nearest)
+        fitted = rule.linearised(model.transition_into(k), at.x, at.F, nearest)
         if model.gain_by_state:
             Q = rule.mean(partial(model.Q_at, k=k), at.x, at.F)
-            N = law.noise_root(half(Q).G)
+            N = fitted.noise_root(half(Q).G)
         else:
-            N = law.noise_root(model.gain(k))
-        y, AF = _at(law, state, at)
+            N = fitted.noise_root(model.gain(k))
+        y, AF = _at(fitted, state, at)
         if here is not None:
             y = model.nearest_state(y, here.x)
         return _run(self._prediction(N.shape[2]), carry, [y, AF, N])
@@ -674,12 +693,12 @@ class _PassesByEpoch(Passes):
         # 0, and the doubt with them.
         slopes_in_doubt = self.kind.about_path and isinstance(rule, SigmaPoints)
         for _ in range(self.kind.iterations):
-            law = rule.linearised(model.observation_at(k), at.x, at.F, nearest)
+            fitted = rule.linearised(model.observation_at(k), at.x, at.F, nearest)
             R = self._noise(k, at)
-            M = law.noise_root(self._least_root(R))
-            y, HF = _at(law, state, at)
+            M = fitted.noise_root(self._least_root(R))
+            y, HF = _at(fitted, state, at)
             y = model.nearest(y, np.where(np.isfinite(z), z, y))
-            H = np.zeros(HF.shape) if slopes_in_doubt else law.slopes(at.F)
+            H = np.zeros(HF.shape) if slopes_in_doubt else fitted.slopes(at.F)
             variances = np.broadcast_to(np.diagonal(R, axis1=1, axis2=2), z.shape)
             each = [z, y, HF, M, H, variances]
             # Each iteration takes the readings in anew.
@@ -715,12 +734,12 @@ def _run(step: Step, carry: Array, parts: Sequence[Array]) -> Array:
     return output[:, 0]
 
 
-def _at(law: Linearised, state: _TrialStates, at: _TrialStates) -> tuple[Array, Array]:
-    """Returns A x + b and A F of a state by a law about the states `at`."""
+def _at(fitted: Linearised, state: _TrialStates, at: _TrialStates) -> tuple[Array, Array]:
+    """Returns A x + b and A F of a state, by what is fitted about the states `at`."""
     if at is state:
-        return law.y, law.AF
-    A = law.slopes(at.F)
-    return law.y + multiply(A, state.x - at.x), np.matmul(A, state.F)
+        return fitted.y, fitted.AF
+    A = fitted.slopes(at.F)
+    return fitted.y + multiply(A, state.x - at.x), np.matmul(A, state.F)
 
 
 def passes_of(model: StateModel, kind: Kind) -> Passes:
@@ -738,6 +757,7 @@ def kept_of(model: StateModel) -> Kept:
     functions = model.epoch_functions
     # A copy with another prior or log begins with what is kept by what it was copied from.
     if kept.get("model") is not model or kept.get("functions") is not functions:
+        # A model is frozen, what it keeps is not: this replaces its cached property.
         kept = vars(model)["passes"] = Kept(model=model, functions=functions)
         kept.parts = FixedParts.of(model)
     return kept

@@ -15,6 +15,15 @@ nothing is inverted, and nothing subtracted from a covariance:
 
 W is the covariance of what a linearisation leaves of f or h. Rows (0, I) below these, of the old
 unit noise v itself, become what it is by the new one, which is all that a smoother takes.
+
+An example: a state x- = 0 with the deviation F- = 4 and a reading z = x + v = 5, whose noise has
+the deviation M = 3. The first row has the length 5, and becomes the first axis; the second has
+3.2 along it and 2.4 across it:
+
+    (3, 4)   ->   (5,   0)         L = 5,    e = 5 / 5 = 1
+    (0, 4)        (3.2, 2.4)       X = 3.2,  F+ = 2.4,  x+ = 0 + 3.2 e = 3.2
+
+So says the Kalman gain, too: X / L = 0.64 = 16 / (16 + 9), and F+^2 = 5.76 = 16 (1 - 0.64).
 """
 
 from __future__ import annotations
@@ -69,8 +78,8 @@ class Linear(NamedTuple):
     y: Vector
     """A x + b"""
     AF: Rows
-    left: Rows
-    """What the rule leaves of each value, whose covariance is W."""
+    residuals: Rows
+    """What the rule leaves of each value at its points, whose covariance is W."""
     A: Rows
 
 
@@ -116,23 +125,24 @@ class Regression(NamedTuple):
         weighted = [[*map(mul, self.c, row)] for row in off]
         across = transposed(self.s)
         AF = [[dot(row, along) for along in across] for row in weighted]
-        left = []
+        residuals = []
         for row, slopes in zip(off, AF, strict=True):
-            left.append([a - dot(slopes, s) for a, s in zip(row, self.s, strict=True)])
-        linear = Linear(mean, AF, left, over(AF, at.F))
+            residuals.append([a - dot(slopes, s) for a, s in zip(row, self.s, strict=True)])
+        linear = Linear(mean, AF, residuals, over(AF, at.F))
         return linear if at is state else _taken_at(state, at, linear)
 
     def noise(self, N: Rows, linear: Linear) -> Rows:
-        left = linear.left
+        residuals = linear.residuals
         if min(self.c) >= 0:
             deviations = np.sqrt(self.c)
-            return beside(N, [[*map(mul, deviations, row)] for row in left])
+            return beside(N, [[*map(mul, deviations, row)] for row in residuals])
         # A negative weight leaves a difference, which has no root of its own.
-        left = [self._told(*given) for given in zip(left, linear.AF, linear.y, strict=True)]
-        weighted = [[*map(mul, self.c, row)] for row in left]
+        each = zip(residuals, linear.AF, linear.y, strict=True)
+        residuals = [self._unless_rounded(*one) for one in each]
+        weighted = [[*map(mul, self.c, row)] for row in residuals]
         W = []
         for own, row in zip(N, weighted, strict=True):
-            pairs = zip(N, left, strict=True)
+            pairs = zip(N, residuals, strict=True)
             W.append([dot(own, noise, dot(row, other)) for noise, other in pairs])
         return root(W)
 
@@ -145,14 +155,14 @@ class Regression(NamedTuple):
         center = g(at.x)
         return [near(y, center, g.periods) for y in values]
 
-    def _told(self, left: Vector, AF: Vector, y: Number) -> Vector:
+    def _unless_rounded(self, residuals: Vector, AF: Vector, y: Number) -> Vector:
         """Returns what is left of a value, or 0 where that is round-off."""
-        squares = [a * a for a in left]
+        squares = [a * a for a in residuals]
         sizes = [abs(one) for one in self.c]
         rounded = _SMALL**2 * sum(sizes) * dot(AF, AF, y * y)
         least = _SMALL * dot(sizes, squares) + rounded
         none = np.less_equal(np.abs(dot(self.c, squares)), least)
-        return [np.where(none, 0.0, a) for a in left]
+        return [np.where(none, 0.0, a) for a in residuals]
 
 
 def _taken_at(state: State, at: State, linear: Linear) -> Linear:
@@ -190,7 +200,8 @@ class Readings(NamedTuple):
 
     def within(self, linear: Linear, M: Rows, most: float) -> Readings:
         """Returns the readings with those missing whose squared innovation exceeds its variance by
-        more than a factor `most`."""
+        more than a factor `most`. With tails M is that of the least noise, which says little of how
+        far away readings lie: a run refuses a gate beside tails."""
         kept = []
         y = near(linear.y, self.z, self.periods)
         for reading, a, noise, slopes in zip(self.z, y, M, linear.AF, strict=True):
@@ -212,13 +223,15 @@ class Update(NamedTuple):
     """L L' is the covariance of innovations; rows of 0 of missing readings."""
     doubt: Number
     """The largest variance of what is read by the digits of a float, in parts of a reading's."""
-    told: Rows
+    unit_noise_rows: Rows
     """For a smoother rows (X, Y): the old unit noise is X e, and Y times the new one. Other noise
     is left of it in columns that the root of the states has not."""
-    judged: dict[str, Sequence[Number]]
-    """Of readings with tails (m,), which have no L: those `predicted`, the standard `deviation` of
-    each innovation, given the readings in front of it the innovation `apart` and `others`, its
-    variance with the least noise, and `own`, that of the reading."""
+    by_mixture: dict[str, Sequence[Number]]
+    """Of readings with tails, which have no L, five numbers each (m,); empty if all are normal.
+    Before any reading of the epoch: `predicted`, what the reading is expected to be; `deviation`,
+    the standard deviation of its innovation. After the readings in front of it: `apart`, its
+    innovation; `others`, the variance of that if the reading has its least noise; `own`, the
+    variance R of the reading."""
 
 
 def updated(state: State, linear: Linear, M: Rows, readings: Readings) -> Update:
@@ -233,13 +246,15 @@ def updated(state: State, linear: Linear, M: Rows, readings: Readings) -> Update
     L = [row[:m] for row in both[:m]]
     e: Vector = []
     for i, (there, row) in enumerate(zip(seen, L, strict=True)):
+        # Of a reading that others or the states give exactly, row[i] is 0: e is no number, and the
+        # trial is lost. Models with a reading that has no noise are refused before.
         rest = y[i] - dot(row[:i], e)
         e.append(np.where(there, rest, 0.0) / np.where(there, row[i], 1.0))
     of_states = both[m : m + n]
     x = plus(state.x, [row[:m] for row in of_states], e)
     F = [row[m : m + n] for row in of_states]
-    told = [row[: m + n] for row in both[m + n :]]
-    return Update(State(x, F), e, L, doubt, told, {})
+    unit_noise_rows = [row[: m + n] for row in both[m + n :]]
+    return Update(State(x, F), e, L, doubt, unit_noise_rows, {})
 
 
 def least_noise(R: Rows, tails: Sequence[Mixture]) -> Rows:
@@ -258,23 +273,24 @@ def _updated_one_by_one(state: State, linear: Linear, M: Rows, readings: Reading
     m = len(M)
     n = len(state.x)
     seen, y, rows, doubt = _prepared(state, linear, M, readings)
-    judged = _judged_before(y, rows, readings)
+    by_mixture = _predicted_by_mixtures(y, rows, readings)
     e: Vector = []
     others: Vector = []
     # How the number of each row moves with the innovations so far.
     X: Rows = [[] for _ in rows]
     for j in range(m):
+        # Reading j is taken off the rows, X keeps them all: rows[i] is that of X[j + 1 + i].
         reading, *rows = rows
         variance = np.where(seen[j], dot(reading, reading), 1.0)
         others.append(variance)
         found = evidence(y[j], variance, readings.variances[j], readings.tails[j])
         by_e = np.sqrt(found.gain)
         e.append(y[j] * by_e)
-        left = np.sqrt(found.left)
+        hidden = np.sqrt(found.left)
         for i, row in enumerate(rows):
             share = dot(row, reading)
             kept = [a - share * found.gain * b for a, b in zip(row, reading, strict=True)]
-            rows[i] = [*kept, share * left]
+            rows[i] = [*kept, share * hidden]
             X[j + 1 + i].append(share * by_e)
         for i in range(j + 1, m):
             y[i] = y[i] - X[i][j] * e[j]
@@ -282,20 +298,24 @@ def _updated_one_by_one(state: State, linear: Linear, M: Rows, readings: Reading
     both = lower(rows)
     x = plus(state.x, X[m : m + n], e)
     F = [row[:n] for row in both[:n]]
-    judged |= {"apart": y, "others": others, "own": readings.variances}
-    told: Rows = []
+    by_mixture |= {"apart": y, "others": others, "own": readings.variances}
+    unit_noise_rows: Rows = []
     if readings.smooths:
-        told = beside(X[m + n :], [row[:n] for row in both[n:]])
-    return Update(State(x, F), e, unit(m), doubt, told, judged)
+        unit_noise_rows = beside(X[m + n :], [row[:n] for row in both[n:]])
+    # L = I stands for none: the likelihood of mixtures is that of `by_mixture`.
+    return Update(State(x, F), e, unit(m), doubt, unit_noise_rows, by_mixture)
 
 
-def _judged_before(y: Vector, rows: Rows, readings: Readings) -> dict[str, Sequence[Number]]:
+def _predicted_by_mixtures(
+    y: Vector, rows: Rows, readings: Readings
+) -> dict[str, Sequence[Number]]:
     """Returns the readings with tails that are predicted, and the deviations of innovations y."""
     deviations = []
+    # The rows go on with those of the states.
     for R, tail, row in zip(readings.variances, readings.tails, rows, strict=False):
         deviations.append(np.sqrt(dot(row, row, (1 - tail.least) * R)))
-    predicted = [a - b for a, b in zip(readings.z, y, strict=True)]
-    return {"predicted": predicted, "deviation": deviations}
+    expected = [a - b for a, b in zip(readings.z, y, strict=True)]
+    return {"predicted": expected, "deviation": deviations}
 
 
 class _Prepared(NamedTuple):
@@ -339,6 +359,7 @@ def _doubt(state: State, H: Rows, M: Rows) -> Number:
     for slopes, noise in zip(H, M, strict=True):
         read = dot([a * a for a in slopes], sizes)
         own = dot(noise, noise)
+        # A missing reading has a row of zeros; one without noise is refused with its model.
         none = np.less_equal(own, 0.0)
         most = np.maximum(most, np.where(none, 0.0, read) / np.where(none, 1.0, own))
     return most
