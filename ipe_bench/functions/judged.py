@@ -52,6 +52,9 @@ _ROUGH = 1e-2
 such as by an integrator's tolerance; `QUICKLY` at the least, in a smooth one."""
 _NOISIEST = 1e-5
 """Part of an output's terms by which a function may be rough."""
+_HIDDEN = 0.1
+"""Part of a change along that direction that roughness may hide; where it hides more, such as among
+numbers that vary by little of themselves, the direction tells nothing, and that is a doubt."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +86,20 @@ class Judged:
         try:
             J = self.complex_slopes(x)
         except Exception:  # functions of `math` and many of SciPy take no complex numbers
-            return value, self.differences(x)
+            return value, self._slopes_by_halves(x)
         rows = np.flatnonzero(self._wrong_slopes(x, value, J))
         if rows.size:
             J[rows] = self.differences(x[rows])
         return value, J
+
+    def _slopes_by_halves(self, x: Array) -> Array:
+        """Computes slopes (rows, m, n) where a row takes no complex numbers: of that row by
+        differences, and of the others as without it."""
+        if len(x) == 1:
+            return self.differences(x)
+        middle = len(x) // 2
+        halves = [self.slopes(half)[1] for half in (x[:middle], x[middle:])]
+        return np.concatenate(halves)
 
     def complex_slopes(self, x: Array) -> Array:
         """Computes slopes (rows, m, n) by complex steps, believed or not; a function that takes no
@@ -133,14 +145,15 @@ class Judged:
         """Finds the rows (rows,) of x where slopes do not tell what the function, whose values are
         `here`, does along one direction."""
         with np.errstate(all="ignore"):
-            rough = self.roughness(x, here, J)
+            rough, moves = self.roughness(x, here, J)
             beyond = ~(rough <= max(8 * _EPS, self.noise))
-            doubts: Mask = np.isfinite(here) & beyond
+            hidden = (self.noise > _HIDDEN * moves) & (moves > 0.0)
+            doubts: Mask = np.isfinite(here) & (beyond | hidden)
             return np.logical_or.reduce(doubts, axis=1)
 
-    def roughness(self, x: Array, here: Array, J: Array) -> Array:
+    def roughness(self, x: Array, here: Array, J: Array) -> tuple[Array, Array]:
         """Computes by which part of their terms the outputs (rows, m), which are `here`, move
-        otherwise along one direction than slopes tell."""
+        otherwise along one direction than slopes tell, and by which part they move."""
         along = _NARROW * self.scale * _direction(_finite(np.abs(J) * self.scale))
         points = np.concatenate([x + along, x - along])
         values = np.asarray(self.function(points), dtype=float)
@@ -155,10 +168,11 @@ class Judged:
         curved = np.fmin(bend, 4 * bend**2 / np.abs(change))
         allowed = curved + _SLOPES * np.abs(change)
         away = np.maximum(np.abs(change - told) - allowed, 0.0)
-        if not away.any():
-            return away
-        part = away / self._terms(x, here, J)
-        return np.where(away == 0.0, 0.0, part)
+        moves = np.maximum(np.abs(change), np.abs(told))
+        if not away.any() and not self.noise:
+            return away, moves
+        terms = self._terms(x, here, J)
+        return np.where(away == 0.0, 0.0, away / terms), moves / terms
 
     def _terms(self, x: Array, here: Array, J: Array) -> Array:
         """Returns the size (rows, m) of the terms of the outputs, which may be larger than the
@@ -239,8 +253,8 @@ def judged(
         if 2 * wrong.sum() > len(points):
             return replace(tried, why="complex steps find other slopes than differences")
         # Where slopes are right, what they do not tell is the roughness of the function.
-        rough = _finite(tried.roughness(points, value, J)[~wrong])
-        noise = 3 * float(rough.max(initial=0.0))
+        rough, _ = tried.roughness(points, value, J)
+        noise = 3 * float(_finite(rough[~wrong]).max(initial=0.0))
         return replace(tried, noise=min(noise, _NOISIEST))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ipe_bench.functions.differences import RIGHT, WRONG, by_differences, judge, measured
-from ipe_bench.functions.judged import Judged
+from ipe_bench.functions.judged import Judged, judged
 from ipe_bench.functions.recording import NotRecorded, compiled_rows, written
 from ipe_bench.measurements import Parameter
 from ipe_bench.states import (
@@ -87,6 +87,39 @@ def test_verdicts_are_the_same_alone_and_in_any_batch():
     for rows in (slice(0, 1), slice(7, 8), slice(5, 40)):
         assert (own.wrong(x[rows], value[rows], J[rows]) == verdicts[rows]).all()
         np.testing.assert_array_equal(own.differences(x[rows]), own.differences(x)[rows])
+
+
+def _rough(x):
+    """Is rough by 1e-6 of itself, and above 101 rises twice as steeply, by a branch that complex
+    steps do not see."""
+    digits = np.modf(np.abs(np.sin(12989.8 * x.real)) * 4.37585453e7)[0]
+    return x + 1e-4 * (2 * digits - 1) + np.where(x.real > 101, np.abs(x) - 101, 0)
+
+
+def test_roughness_does_not_hide_slopes_off_by_a_factor_of_numbers_that_vary_little():
+    near_100 = 100 + np.linspace(-0.1, 0.1, 9)[:, None]
+    own = judged(_rough, near_100, np.array([0.1]))
+    assert 1e-7 < own.noise
+    x = np.linspace(101.15, 101.3, 15)[:, None]
+    slope = own.slopes(x)[1].ravel()
+    assert np.median(slope) == pytest.approx(2.0, rel=0.01)
+    assert (np.abs(slope - 2) < 0.02).mean() > 0.8
+
+
+def _root(x):
+    """Takes no complex numbers above 1."""
+    if np.iscomplexobj(x) and (x.real > 1).any():
+        raise TypeError("complex")
+    return np.sin(x)
+
+
+def test_a_row_that_takes_no_complex_numbers_leaves_the_slopes_of_others_as_they_are():
+    own = judged(_root, np.linspace(-0.5, 0.5, 5)[:, None], np.array([0.1]))
+    x = np.array([0.3, 0.7, 2.0, -0.4, 0.9])[:, None]
+    slope = own.slopes(x)[1].ravel()
+    alone = [own.slopes(row[None])[1].item() for row in x]
+    assert slope.tolist() == alone
+    np.testing.assert_allclose(slope, np.cos(x[:, 0]), rtol=1e-7)
 
 
 def _swallowed(x):
