@@ -86,6 +86,10 @@ def _changes(search: Program, inputs: int, place: int) -> tuple[Array, Array, Ar
     near = rng.uniform(-2.0, 2.0, (inputs, _NEAR))
     powers = 10.0 ** rng.uniform(*_POWERS, (inputs, _FAR))
     far = powers * rng.choice([-1.0, 1.0], (inputs, _FAR))
+    # Numbers of both signs have no roots and logarithms together: every second point has none below
+    # 0, as most equations mean them.
+    for points in (near, far):
+        points[:, ::2] = np.abs(points[:, ::2])
     drawn = np.concatenate([near, far], axis=1)
     root = drawn[place]
     # Newton's method, in one coordinate: x <- x - gap / (dgap/dx).
