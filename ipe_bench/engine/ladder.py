@@ -84,6 +84,13 @@ def apart(fine: Array, coarse: Array) -> Array:
         return np.nan_to_num(share, nan=np.inf).max(axis=1, initial=0.0)
 
 
+def shares(gaps: Array, tolerance: Array) -> Array:
+    """Returns gaps of readings (trials, m) in shares of their tolerances; 0 where there is none, as
+    of an exact reading at the start, whose tolerance may be 0."""
+    with np.errstate(all="ignore"):
+        return np.where(gaps == 0.0, 0.0, gaps / tolerance)
+
+
 def _largest(y: Array) -> Array:
     """Returns the largest magnitude (trials, states) over all times and cases."""
     return np.abs(y).max(axis=3).max(axis=1)
@@ -165,8 +172,9 @@ class _Climb:
         self.found[rows] = np.where(coarse_holds, below, place)
         # These trials are done: from here on `fine` has the readings of the place that is found.
         self.fine[rows[coarse_holds]] = self.coarse[rows[coarse_holds]]
-        # Where rounding shows, what finer steps move is what they leave; a stated rate promises the
-        # eighth order.
+        # At the top a trial is kept though its error exceeds the tolerance, up to `NOT_FOLLOWED`
+        # times: rounding shows there, and what finer steps move is what they leave; a stated rate
+        # promises the eighth order.
         off = coarse_error / SAFETY if self.has_states else fine_error
         self.lost[rows] = (place == self.top) & (off > NOT_FOLLOWED)
         if self.has_states:
@@ -197,7 +205,7 @@ class _Climb:
         astray = apart(self.fine_states[rows, :, :-1], self.coarse_states[rows, :, :-1])
         with np.errstate(all="ignore"):
             gaps = np.abs(fine - self.asked.unturned(self.coarse[rows], fine))
-            shifts = (gaps / self.asked.tolerance).max(axis=1)
+            shifts = shares(gaps, self.asked.tolerance).max(axis=1)
             error = SAFETY * np.maximum(shifts, astray / STATES)
         return np.nan_to_num(error, nan=np.inf)
 

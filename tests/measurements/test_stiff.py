@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from shared.oracles import assert_agrees
 from shared.slopes import differentiate
 
-from ipe_bench.engine.rodas import _REACH, SHAPE, Rodas5P
+from ipe_bench.engine.rodas import _REACH, SHAPE, Rodas5P, _sums
 from ipe_bench.measurements import Ode, OdeMeasurement, Parameter
 
 # fmt: off
@@ -122,6 +122,22 @@ def test_a_stiff_model_is_found_and_is_within_its_tolerance():
         k - 0.01
     ) * t * np.exp(-k * t)
     assert_agrees(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
+
+
+def test_sums_over_a_step_have_the_same_bits_alone_and_among_others():
+    values = np.random.default_rng(0).normal(size=(2, 64, 5))
+    together = _sums(values)
+    for lane in range(5):
+        assert (_sums(values[:, :, lane : lane + 1])[:, 0] == together[:, lane]).all()
+
+
+@pytest.mark.oracle("closed form: an exponential", "readings that are exact at the start", 2e-6)
+@pytest.mark.parametrize("method", ["explicit", "implicit"])
+def test_a_tolerance_may_grow_from_0_at_the_start(method):
+    times = (0.0, 1.0, 2.0)
+    options = {"times": times, "tolerance": "1e-6*t", "method": method}
+    model = Ode(rates={"y": "-k*y"}, start={"k": 1.0}, initial={"y": 1.0}, **options)
+    assert_agrees(model.simulate(np.array([[1.0]]))[0], np.exp(-np.array(times)), atol=2e-6)
 
 
 @pytest.mark.parametrize("divisors", [3, 60, 130])

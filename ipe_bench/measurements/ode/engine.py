@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, own
-from ipe_bench.engine.ladder import NOT_FOLLOWED
+from ipe_bench.engine.ladder import NOT_FOLLOWED, shares
 from ipe_bench.engine.rodas import SHAPE, STABLE, Rodas5P
 from ipe_bench.measurements.arithmetic import Arithmetic, evaluate, parse
 from ipe_bench.measurements.base import Parameter
@@ -172,7 +172,7 @@ class DescribedEquations(OdeMeasurement):
 
     def _off(self, z: Array, reference: Array) -> Array:
         """Computes differences of readings (trials, m) from others, in tolerances."""
-        return np.abs(z - self.near(reference, z)) / self._tolerances
+        return shares(np.abs(z - self.near(reference, z)), self._tolerances)
 
     def off(self, x: Array) -> float:
         """Computes by how many tolerances the explicit method differs from the implicit one in a

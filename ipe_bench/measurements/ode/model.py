@@ -328,7 +328,7 @@ class OdeMeasurement(Measurement):
     def _alike(self, z: Array, other: Array) -> Mask:
         """Selects the trials whose readings (trials, m) by two methods are alike."""
         with np.errstate(all="ignore"):
-            off = np.abs(z - self.near(other, z)) / self._tolerances
+            off = ladder.shares(np.abs(z - self.near(other, z)), self._tolerances)
         return off.max(axis=1) <= ladder.NOT_FOLLOWED
 
     @cached_property
@@ -340,8 +340,15 @@ class OdeMeasurement(Measurement):
     @cached_property
     def _implicit(self) -> Rodas5P:
         """The implicit method, more accurate than the tightest tolerance of a reading."""
-        rtol = _IN_HAND * np.min(self._tolerances) / self._largest
+        rtol = _IN_HAND * self._tightest / self._largest
         return Rodas5P(self.stepped, float(np.clip(rtol, 1e-10, 1e-4)))
+
+    @cached_property
+    def _tightest(self) -> float:
+        """The least tolerance above 0, which is that of a reading of the exact start; 0 if there is
+        none."""
+        above = self._tolerances[self._tolerances > 0.0]
+        return float(above.min()) if len(above) else 0.0
 
     @cached_property
     def _largest(self) -> float:
@@ -389,8 +396,9 @@ class OdeMeasurement(Measurement):
         them."""
         along = len(z), self.tables.shape[1], stop, len(self.outputs)
         with np.errstate(all="ignore"):
-            moved = reach / self._largest * np.min(self._tolerances)
-            astray = moved > _MAGNIFIED * self._tolerances[self.rows(stop)]
+            moved = reach / self._largest * self._tightest
+            tolerances = self._tolerances[self.rows(stop)]
+            astray = (moved > _MAGNIFIED * tolerances) & (tolerances > 0.0)
         at_time = astray.reshape(along).any(axis=3, keepdims=True)
         lost = np.logical_or.accumulate(at_time, axis=2) | (not self._is_held)
         return np.where(lost, np.nan, z.reshape(along)).reshape(z.shape)
@@ -601,7 +609,7 @@ class OdeMeasurement(Measurement):
         self._jacobian_kernel.run(*given, coarse.reshape(-1))
         exact = self._shown(x, stop, self._zeros)[:, rows]
         with np.errstate(all="ignore"):
-            off = np.abs(z - exact) / self._tolerances[rows]
+            off = ladder.shares(np.abs(z - exact), self._tolerances[rows])
         return coarseness.Coarseness(fourth, coarseness.times_longer(off, coarse[0], J[0, rows]))
 
     @property
