@@ -5,6 +5,9 @@ the moment of the jump: such equations are refused. A kink is no jump, as both s
 agree where it changes. That is asked of numbers: where the operands of the comparison are equal,
 the rates are evaluated as if it held, and as if it failed. Their difference vanishes there at a
 kink, and is what it is nearby at a jump.
+
+A sample may miss a jump: one that is seen in a small part of the inputs alone, as between t = 5 and
+5.01, or where operands are equal in a whole region, as of sqrt(y*y) + y <= 0.
 """
 
 from __future__ import annotations
@@ -71,6 +74,7 @@ def _jumps_at(tape: Recording, comparison: Expression) -> bool:
         with np.errstate(all="ignore"):
             points, below, above = _changes(search, len(inputs), place)
             away = _away(above)
+            # The values just below and just above the change, and one further away of each.
             for near, beside in ((below, below - away), (above, above + away)):
                 here = _computed(rates, points, place, near)
                 there = _computed(rates, points, place, beside)
@@ -86,11 +90,10 @@ def _changes(search: Program, inputs: int, place: int) -> tuple[Array, Array, Ar
     near = rng.uniform(-2.0, 2.0, (inputs, _NEAR))
     powers = 10.0 ** rng.uniform(*_POWERS, (inputs, _FAR))
     far = powers * rng.choice([-1.0, 1.0], (inputs, _FAR))
-    # Numbers of both signs have no roots and logarithms together: every second point has none below
-    # 0, as most equations mean them.
-    for points in (near, far):
-        points[:, ::2] = np.abs(points[:, ::2])
     drawn = np.concatenate([near, far], axis=1)
+    # Many numbers of any sign hardly ever have all their roots and logarithms: in every second
+    # point they are positive, as most equations mean them.
+    drawn[:, ::2] = np.abs(drawn[:, ::2])
     root = drawn[place]
     # Newton's method, in one coordinate: x <- x - gap / (dgap/dx).
     for _ in range(_NEWTON):

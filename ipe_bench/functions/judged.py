@@ -5,6 +5,16 @@ is not, as at np.abs. So at every point where they are used they are tried in tw
 values, along one direction that moves all numbers, tell what slopes should have told; that costs
 little, and leaves a doubt where it does not agree. Only in doubt are differences taken along each
 number by itself, which find slopes wrong (a *contradiction*), and take their place.
+
+    stage           values a row  compared with     a row goes on if they are apart by more than
+    _doubted        2             slopes along      _SLOPES of the change, its bend, and round-off
+                                  one direction     or `noise` of the output's terms; or if `noise`
+                                                    hides _HIDDEN of the change
+    contradicted    25 a number   slopes along      3 errors of the differences, and narrow ones,
+                                  each number       of _BESIDE_A_KINK, do not find them right
+    differences                                     these are the slopes of a row that comes here
+
+Where differences tell nothing of a slope, that of complex steps stays.
 """
 
 from __future__ import annotations
@@ -97,9 +107,7 @@ class Judged:
         differences, and of the others as without it."""
         if len(x) == 1:
             return self.differences(x)
-        middle = len(x) // 2
-        halves = [self.slopes(half)[1] for half in (x[:middle], x[middle:])]
-        return np.concatenate(halves)
+        return np.concatenate([self.slopes(half)[1] for half in np.array_split(x, 2)])
 
     def complex_slopes(self, x: Array) -> Array:
         """Computes slopes (rows, m, n) by complex steps, believed or not; a function that takes no
@@ -164,12 +172,12 @@ class Judged:
         change = (ahead - behind) / 2
         bend = np.abs(ahead + behind) / 2
         told = (J * along[:, None]).sum(axis=2)
-        # A difference of one step is off by about its bend squared, but at kinks.
+        # A difference of one step is off by about its bend squared, but at kinks by the bend.
         curved = np.fmin(bend, 4 * bend**2 / np.abs(change))
         allowed = curved + _SLOPES * np.abs(change)
         away = np.maximum(np.abs(change - told) - allowed, 0.0)
         moves = np.maximum(np.abs(change), np.abs(told))
-        if not away.any() and not self.noise:
+        if not (away.any() or self.noise):
             return away, moves
         terms = self._terms(x, here, J)
         return np.where(away == 0.0, 0.0, away / terms), moves / terms
