@@ -8,6 +8,31 @@ Runge-Kutta formula, and `read` what is shown at a reading's time. Jacobians com
 variational equations d' = J d + source, in the same stages: each direction of the parameters has
 its own d and source, and J is shared. So each stage of the state leaves what J and the sources need
 of it, and what does not change along the solution is computed once.
+
+For example y' = -p y with y(0) = 1, of which y is read. Its readings take a frame of 4 numbers:
+
+    place   0   1   2    3
+    holds   p   y   -p   reading
+
+`begin` fills 1 and 2 (-p is `fixed`), `rates` multiplies 2 by 1, `read` copies 1 to 3. Its
+Jacobians, by a formula of 12 stages, take a frame of 17, where d' = -p d - y begins at d = 0; the
+coefficient -p of d is fixed, and the source -y changes from stage to stage:
+
+    place   0   1   2    3   4 to 15              16
+    holds   p   y   -p   d   -y of each stage     reading of d
+
+The fields of a `StepPlan` that differ:
+
+    field     of readings                     of Jacobians
+    rates     slope                           slope, and what a stage keeps for deviations
+    step      rates, and the side of poles    rates
+    read      the readings                    what the reading of a deviation needs
+    read_at   places of the readings          places of what that needs
+    shown     `read_at` itself                places of a deviation of the readings
+
+`emit.integrator` writes machine code of a plan: it alone reads the places, and the order of the
+calls of `_Frame.room` is their order. A wrong place computes a wrong number: the tests of
+test_ode_paths.py hold every path to the bits of a plain loop.
 """
 
 from __future__ import annotations
@@ -32,7 +57,7 @@ class LinearProgram:
     program: Program
     """Program from (d, sources, coefficients, fixed)."""
     sources: tuple[tuple[int, ...], ...]
-    """Places (n, sources) of the sources of each direction."""
+    """Places (parameters, sources) of the sources along each parameter."""
     saved: range
     """Places of the coefficients in J that change along the solution."""
 
@@ -49,7 +74,7 @@ class TangentPlan:
     """Program of the readings' deviation."""
     kept: tuple[range, ...]
     """Places where each stage keeps the coefficients and sources that change along the solution;
-    the sources that do not lie behind them."""
+    behind them lie the sources that do not change."""
     stage_size: int
     """Numbers that lie in a stage."""
 
@@ -280,16 +305,19 @@ class _Linear:
         self.sources = tape.along_each(along.dp, sources)
         """The value (n, sources) of each source along each parameter."""
         linear_in = (*along.d, *names)
-        # Coefficients of J are what enters the linear part from outside: it computes no more.
+        # Coefficients of J are what enters the linear part from outside: it computes no more. The
+        # names of inputs may repeat in another `_Linear` of this graph: programs go by expressions.
         coefficients = trace.border(outputs, trace.dependent(outputs, linear_in))
         values = [e for row in self.sources for e in row]
         varying = trace.dependent([*coefficients, *values], tape.moving)
         self.fixed = [e for e in coefficients if e not in varying]
         self.saved = [e for e in coefficients if e in varying]
-        # A source may be one of the coefficients, too: it is kept once.
+        # Of y' = -p y: d is linear in -p d + source0; the coefficient -p is fixed, the source -y
+        # varies. A source may be one of the coefficients, too: it is kept once.
         driving = [e for e in values if e in varying and e not in self.saved]
         self.changing = [*self.saved, *_distinct(driving)]
-        """What changes along a solution, and is kept at each stage or reading."""
+        """What changes along a solution, and is kept at each stage or reading: coefficients first,
+        so that they lie side by side."""
         self.constant_sources = _distinct(e for e in values if e not in varying)
         self.inputs = [*linear_in, *self.saved]
         self.outputs = outputs
@@ -308,7 +336,8 @@ class _Linear:
         return at[len(self.changing) :]
 
     def placed(self, at: range, fixed: Sequence[Expression]) -> LinearProgram:
-        """Places what is kept at `at`, and the `fixed` numbers as the last inputs."""
+        """Makes the program J d + source whose sources and changing coefficients lie at `at`; the
+        `fixed` numbers of the frame are its last inputs, used or not."""
         lying = [*self.changing, *self.constant_sources]
         place = dict(zip(lying, at, strict=True))
         sources = tuple(tuple(place[e] for e in row) for row in self.sources)

@@ -131,8 +131,8 @@ def by_differences(
 
 
 def quick(h: Rows, x: Array, scale: Array, near: Near = unmoved) -> tuple[Array, Array]:
-    """Returns slopes (rows, m, n) per widest step by three steps of the ladder, and by which part
-    of an output's slopes these disagree at the most (rows, n)."""
+    """Returns slopes (rows, m, n) per widest step, above 0, by three steps of the ladder, and by
+    which part of an output's slopes these disagree at the most (rows, n)."""
     parts = RATIO ** -np.array(_QUICK, dtype=float)
     with silent():
         found = sampled(h, x, along_units(scale, len(x)), near, parts)
@@ -148,6 +148,9 @@ def quick(h: Rows, x: Array, scale: Array, near: Near = unmoved) -> tuple[Array,
         apart = np.maximum(apart, QUICKLY * correction / SMALL)
         largest = np.abs(slope).max(axis=2, keepdims=True)
         apart = apart / not_small(np.abs(slope), largest)
+        # An output that does not move is flat: most do not depend on that number. So is a function
+        # that is constant in pieces, as by np.round, within one of them, which `flat` of a
+        # measurement tells the user; and 0 is a slope of abs(x) at 0.
         still = (C == 0.0).all(axis=0)
         return slope, np.where(still, 0.0, apart).max(axis=1)
 
@@ -294,7 +297,7 @@ def _blur(x: Array, directions: Array) -> Array:
 
 
 class _Column(NamedTuple):
-    """Holds differences that are extrapolated so many times, one for each step but the widest."""
+    """Holds differences that are extrapolated k times: one for each of the levels but k."""
 
     value: Array
     error: Array
@@ -322,7 +325,15 @@ def _columns(C: Array, noise: Array, order: int) -> Iterator[_Column]:
 
 def _limit(C: Array, noise: Array, order: int) -> Limit:
     """Extrapolates differences C (levels, ...) of shrinking steps, each with its noise, and takes
-    the value of the least error."""
+    the value of the least error; the slope of the finest step, with an infinite error, if none has
+    an error that is finite.
+
+    Of levels 0, 1, 2, ... from wide to fine, the i-th value of the k-th column has
+
+        steps used    i to i + k
+        moved there   moved[i - 1] to moved[i + k - 1], by a step from the one before
+        seen finer    levels i + k + 1 and on
+    """
     moved = np.abs(np.diff(C, axis=0))
     # What moves beyond noise from each step to finer ones, at the most.
     beyond = moved - 3 * (noise[:-1] + noise[1:])

@@ -71,8 +71,8 @@ class Attempts(ABC):
         at the start or where the readings point."""
 
     def plain(self, k: int, rows: Rows) -> Minima:
-        """Runs Levenberg-Marquardt on all data from the start: in the metric of the
-        parameters' sizes (0), and in Marquardt's (1)."""
+        """Runs Levenberg-Marquardt on all data from the start: in the metric of the parameters'
+        sizes if k is 0, and in Marquardt's if it is 1."""
         method = (LevenbergMarquardtMethod(1.0, sizes=1.0), LevenbergMarquardtMethod(1e-3))[k]
         x = repeated(self.problem.x0, len(rows))
         return self.minimize(rows, method, x, max(LONG, self.limits.max_iterations))
@@ -108,7 +108,8 @@ class Attempts(ABC):
         return CountingModel(measurement, self.tally.copied(owner), share)
 
     def charge(self, owner: Rows, tally: EvaluationCount) -> None:
-        """Adds to each trial what its candidates have cost since they were `counted`."""
+        """Adds to each trial what its candidates have cost since they were `counted`; no other
+        charge of these trials may lie in between, as what they cost by now is taken off."""
         for name in ("simulations", "jacobians", "reported"):
             total = getattr(self.tally, name)
             spent = getattr(tally, name) - total[owner]

@@ -47,7 +47,8 @@ class Round(State):
     steps: NDArray[np.int64]
     """Inner steps so far."""
     path: list[Array]
-    """The iterates (steps + 1, n) of each trial, where a history was asked for."""
+    """The iterates (steps + 1, n) of each trial: a few inner steps of each round, kept whether or
+    not a history is asked for."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,8 @@ class Relinearized(Method[FrozenSystem, Round], Estimator):
     inner_iterations: Count = 5
     """Steps of the solver before H is evaluated again."""
     max_iterations: Count = 30
-    """Rounds, each with a new H."""
+    """Rounds, each with a new H; the iterations of a result are inner steps, up to
+    `inner_iterations` of each round."""
     tolerance: Positive = 1e-6
     """Largest abs(F_i(x_k)) at the linearisation there, in standard deviations of the local
     bound."""
