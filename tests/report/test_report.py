@@ -383,6 +383,32 @@ def test_the_page_says_which_commands_computed_what_it_shows(synthetic):
     assert page.count("from Python") == 1
 
 
+def test_a_command_that_is_run_again_is_the_last(synthetic):
+    fill(synthetic)
+    record = json.loads(
+        next((synthetic.directory / "runs").glob("*.json")).read_text(encoding="utf-8")
+    )
+    record = {k: v for k, v in record.items() if k not in ("schema", "file", "run", "digest")}
+    for k, name in enumerate("abcda"):
+        again = {"command": f"ipe-bench run name={name}", "started": f"2030-01-0{k + 1}T00:00:00"}
+        synthetic.store.write_run(f"z{k}", record | again)
+    analysis = analyse([synthetic.directory])
+    page = render_page(analysis, all_tables(analysis), [])
+    told = re.findall(r'<details class="run"><summary>(.{10}).*name=(\w)', page)
+    assert told[:4] == [(f"2030-01-0{day}", name) for day, name in zip("5432", "adcb", strict=True)]
+
+
+def test_a_figure_of_a_plugin_is_shown_whatever_its_name_begins_with(synthetic):
+    fill(synthetic)
+    analysis = analyse([synthetic.directory])
+    ours = figures.Drawn("success_gins", "Ours", "", (), "<svg/>", False, "success")
+    names = ("success_map", "matrix_x", "tracks_lost")
+    theirs = [figures.Drawn(name, name, "", (), "<svg/>", False, name) for name in names]
+    page = render_page(analysis, all_tables(analysis), [ours, *theirs])
+    assert all(name in page for name in names)
+    assert "Ours" not in page
+
+
 def test_physical_numbers_of_any_size_have_three_figures_and_what_is_not_finite_a_word():
     shown = [_physical(value) for value in (1.5e-7, 2.0e6, 12.345, np.inf, np.nan)]
     assert shown == ["1.50e-7", "2e6", "12.3", "inf", "-"]

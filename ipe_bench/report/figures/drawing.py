@@ -36,6 +36,8 @@ class Drawn:
     """The figure as a page shows it."""
     wide: bool
     """Whether it takes the width of the page."""
+    kind: str = ""
+    """Its name without that of the setting, where a page has one for each."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,8 @@ class Drawing:
     title: str
     caption: str
     figure: Canvas
+    kind: str = ""
+    """Its name without that of the setting, where a page has one for each."""
 
     def drawn(self, folder: Path, formats: Sequence[str]) -> Drawn:
         """Writes the figure, and returns what a page shows of it."""
@@ -53,7 +57,7 @@ class Drawing:
         # Laid out once: again for the page takes a third of the time.
         self.figure.set_layout_engine("none")
         wide = self.figure.get_figwidth() > _WIDE
-        return Drawn(self.name, self.title, self.caption, files, self.html(), wide)
+        return Drawn(self.name, self.title, self.caption, files, self.html(), wide, self.kind)
 
     def shown(self) -> Canvas:
         """Shows the figure itself in a notebook."""

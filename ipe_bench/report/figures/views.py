@@ -115,7 +115,7 @@ class View:
         caption go."""
         titled = f"{title} ({self.label})" if self.label else title
         words = " ".join(filter(None, caption))
-        return Drawing(f"{name}{self.suffix}", titled, words, figure)
+        return Drawing(f"{name}{self.suffix}", titled, words, figure, name)
 
     def only(self, names: Sequence[str]) -> View:
         """Returns the same view with those frames alone."""

@@ -28,7 +28,7 @@ MOST_RUNS = 20
 MOST_COMMANDS = 3
 """Largest number of commands at the head of the page; all stand with the provenance."""
 _OF_TRACKS = ("one_track", "tracks")
-"""Names of the figures that a page of states shows at once."""
+"""Kinds of figures that a page of states shows at once."""
 _PYTHON = "from Python"
 _UNKNOWN = "a command that was not recorded"
 
@@ -49,9 +49,9 @@ def render_page(
     answer = [part for part in headline(analysis) if not lead or part != MEANING]
     # What the matrix shows is not drawn a second time, and the whole table is folded below it.
     tiled = any(isinstance(part, Matrix) for part in answer)
-    pictures = [figure for figure in figures if not figure.name.startswith((MATRIX, SUCCESS))]
+    pictures = [figure for figure in figures if figure.kind not in (MATRIX, SUCCESS)]
     # One track says what the numbers are of: it stands before the errors of all.
-    of_tracks = [one for one in pictures if one.name.startswith(_OF_TRACKS)]
+    of_tracks = [one for one in pictures if one.kind in _OF_TRACKS]
     seen = of_tracks[:2] or pictures[:1]
     main: list[Part] = [table for table in tables if not table.appendix]
     opened = [] if tiled else main[:1]
@@ -139,12 +139,14 @@ def _provenance(runs: Sequence[Mapping[str, Any]], older: int) -> list[str]:
 
 
 def _runs(runs: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], int]:
-    """Returns what was computed, by command, the last first, and the number of older commands; a
-    run that found everything stored computed no trial."""
+    """Returns what was computed, by command, that of the last run first, and the number of older
+    commands; a run that found everything stored computed no trial."""
     commands: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for run in runs:
         if run.get("blocks", 1):
-            commands.setdefault(_command(run), []).append(run)
+            command = _command(run)
+            # A command that is run again moves to the end.
+            commands[command] = [*commands.pop(command, []), run]
     last_first = list(reversed(commands.items()))[:MOST_RUNS]
     found = [_entry(command, records) for (command, _), records in last_first]
     return found, len(commands) - len(found)
@@ -172,7 +174,7 @@ def _entry(command: str, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
     return {
         "command": command,
-        "started": _minute(records[0]["started"]),
+        "started": _minute(last["started"]),
         "facts": facts,
         "config": json.dumps(config, indent=1, ensure_ascii=False),
     }
