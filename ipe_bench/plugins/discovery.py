@@ -394,7 +394,9 @@ def _composed(option: Option, above: tuple[Path, ...]) -> dict[str, Any]:
     """Composes an option that the files `above` it name."""
     if option.path in above:
         raise UserError(f"{option.path}: defaults: names itself, or a file that names it")
-    config = dict(_mapping(option))
+    if option.fault is not None:
+        raise UserError(option.fault)
+    config = dict(option.config)
     given = config.pop("defaults", None) or []
     if not isinstance(given, list):
         raise UserError(f"{option.path}: defaults: is no list; write defaults: [{given}]")
@@ -410,17 +412,6 @@ def _composed(option: Option, above: tuple[Path, ...]) -> dict[str, Any]:
         other = config if entry == "_self_" else _composed(known[name], (*above, option.path))
         found = merged(found, other)
     return found
-
-
-def _mapping(option: Option) -> Mapping[str, Any]:
-    """Returns the keys of an option's file; none of an empty one."""
-    try:
-        config = option.config or {}
-    except yaml.YAMLError as error:
-        raise UserError(explain_yaml(error, option.path)) from None
-    if not isinstance(config, Mapping):
-        raise UserError(f"{option.path}: has no keys; write KEY: VALUE lines")
-    return config
 
 
 def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
