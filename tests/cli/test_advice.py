@@ -285,6 +285,11 @@ ADVICE = [
     ),
     ("estimate state_model=growth", WORD, "estimate state_model=growth {}", {"FILE": "z.csv"}),
     (
+        "estimate state_model=growth readings=z.csv gate=95",
+        r"write (\S+) for",
+        "estimate state_model=growth readings=z.csv {}",
+    ),
+    (
         "design measurement=polynomial --by",
         r"write (\S+)",
         "design measurement=polynomial {}",
@@ -367,6 +372,7 @@ ELSEWHERE = {
         "{}: data sets simulated from it",
         "noise=unknown: the level",
         "noise=unknown: the {} readings",
+        "noise=unknown: {} readings are too few",
         "measurement={}: H has not",
         "measurement={}: {}; choose another start",
     ),
