@@ -17,7 +17,7 @@ test: .venv/ready
 
 # What takes minutes: Monte Carlo, end-to-end and browser checks.
 slow: .venv/ready
-	$(BIN)/pytest -n auto --dist worksteal --durations=40 --durations-min=1 -m "slow or browser"
+	$(BIN)/pytest -n auto --dist worksteal --durations=40 --durations-min=1 -m "(slow or browser) and not campaign"
 
 # Slurm: two nodes on this machine. On Debian, `apt-get install slurm-wlm munge` first; as root.
 cluster: .venv/ready

@@ -172,6 +172,7 @@ ADVICE = [
         {"LABEL": "grid"},
     ),
     ("run state_model=pendulum_book", WORD, "run state_model=pendulum_book {}"),
+    ("estimate state_model=pendulum_book gate=99.9", WORD, "estimate state_model=pendulum_book {}"),
     (f"{NISTS} noise=certified", WORD, f"{NISTS} noise=certified {{}}"),
     ("run measurement=polynomial noise=certified", r"or (\S+)", "run noise=certified trials=1 {}"),
     (NISTS, WORD, f"{NISTS} {{}}"),

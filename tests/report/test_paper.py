@@ -161,7 +161,7 @@ def test_a_figure_is_as_wide_as_the_column_and_the_report_stays_as_it_is(
         box = re.search(rb"/MediaBox \[ *([\d. ]+) *\]", done[1].read_bytes())
         left, _, right, _ = map(float, box[1].split())
         assert (right - left) / 72 == pytest.approx(width, abs=0.01)
-        assert "simulations" in done[2].read_text(encoding="utf-8")
+        assert "Cost against accuracy, all trials" in done[2].read_text(encoding="utf-8")
     after, *_ = figures.draw_all(analysis, tmp_path / "b")
     assert before.files[0].read_bytes() == after.files[0].read_bytes()
 

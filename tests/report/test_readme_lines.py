@@ -26,9 +26,11 @@ from ipe_bench.statistics.analysis import analyse
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DRAWN = "outputs/headline/figures/success.png"
+TYPED = re.sub(r"(?ms)^```.*?^```$", "", README)
 LINES = [
-    line.removeprefix("    ") for line in README.splitlines() if line.startswith("    ") or not line
+    line.removeprefix("    ") for line in TYPED.splitlines() if line.startswith("    ") or not line
 ]
+"""What a reader types in a shell, and not in Python."""
 
 
 def test_it_leads_somewhere():
