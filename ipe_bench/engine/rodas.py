@@ -96,6 +96,8 @@ SHAPE = 1e-4
 """A relative tolerance that shows the shape of a solution."""
 _SMALLEST = 1e-9
 """Absolute tolerance over the relative one, in units of the states."""
+_ROUNDING = 4 * np.finfo(float).eps
+"""Round-off of a rate, as a part of the sum of its terms."""
 _SAFETY = 0.9
 """Part of the step that the error allows which is taken next."""
 _SHRINK = 0.2
@@ -417,12 +419,13 @@ class _Run:
             S1 = _ended(S1, D)
         largest = np.maximum(np.abs(y), np.abs(y1))
         # The norm is the largest error of a state in units of its tolerance.
-        tolerance = self.atol + self.rtol * largest
+        rounding = _rounding(J, h, largest)
+        tolerance = np.maximum(self.atol + self.rtol * largest, rounding)
         error = (np.abs(K[-1]) / tolerance).max(axis=0)
         if self.timed:
             # A pulse between the stages shows in the mean rate over the step.
             unseen = _solved(W, exchanged, self._unseen(live, h))
-            tolerance = self.atol + _UNSEEN * largest
+            tolerance = np.maximum(self.atol + _UNSEEN * largest, rounding)
             missed = (np.abs(unseen) / tolerance).max(axis=0)
             error = np.where(missed > 1.0, np.fmax(missed, error), error)
         if self.divided:
@@ -539,6 +542,15 @@ def _to_the_reading(h: Array, left: Array) -> Array:
     it."""
     sliver = np.where(2 * h > left, left / 2, h)
     return np.where(h >= left * (1 - 1e-9), left, sliver)
+
+
+def _rounding(J: Array, h: Array, sizes: Array) -> Array:
+    """Computes what round-off of the rates moves states (n, lanes) by in a step h, from J (n, n,
+    lanes): all that a state holds that would be 0, as where large ones cancel in its rate."""
+    terms = _sums(np.abs(J) * sizes)
+    # A state that is pulled back as fast as J_ii forgets what is older than 1 / |J_ii|.
+    pull = np.abs(J[range(len(J)), range(len(J))])
+    return _ROUNDING * terms * h / (1.0 + GAMMA * h * pull)
 
 
 def _sums(values: Array) -> Array:

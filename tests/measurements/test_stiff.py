@@ -124,6 +124,19 @@ def test_a_stiff_model_is_found_and_is_within_its_tolerance():
     assert_agrees(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
 
 
+@pytest.mark.oracle("closed form: a state that is 0, of large ones that cancel", "its size", 1e-9)
+def test_a_state_that_holds_only_the_round_off_of_large_ones_takes_no_short_steps():
+    rates = {"d": "100*(a-b) - k*d", "a": "-0.1*k*a", "b": "-0.1*(b*k*7)/7"}
+    initial = {"a": 1000.0, "b": 1000.0}
+    times = (1.0, 5.0)
+    model = Ode(rates=rates, start={"k": 0.7}, initial=initial, times=times, method="implicit")
+    method = Rodas5P(model.engine.stepped, 1e-8)
+    d, a, _ = method.simulate(model.nominal[None], 2)[0].reshape(2, 3).T
+    assert_agrees(d, np.zeros(2), atol=1e-9)
+    assert_agrees(a, 1000.0 * np.exp(-0.07 * np.array(times)), rtol=1e-10)
+    assert method.measured(model.nominal[None])[1].steps < 100
+
+
 def test_sums_over_a_step_have_the_same_bits_alone_and_among_others():
     values = np.random.default_rng(0).normal(size=(2, 64, 5))
     together = _sums(values)
