@@ -45,7 +45,7 @@ def estimate_command(arguments: Sequence[str]) -> int:
 
 def standard_words(arguments: Sequence[str]) -> list[str]:
     """Returns the words that choose estimators and trackers where no argument does."""
-    of_filters = any(word.startswith(("find=", "gate=")) for word in arguments)
+    of_filters = any(word.lstrip("+").startswith(("find=", "gate=")) for word in arguments)
     choice = standard.OF_ESTIMATE | (standard.OF_FILTERS if of_filters else {})
     return [f"{group}=[{','.join(names)}]" for group, names in choice.items()]
 

@@ -9,6 +9,7 @@ import pytest
 
 import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
+from ipe_bench.cli.estimate import standard_words
 from ipe_bench.cli.own_data import like_these
 from ipe_bench.cli.single import single
 from ipe_bench.cli.spec import Spec
@@ -62,3 +63,8 @@ def test_correlated_errors_of_readings_that_are_missing_are_not_simulated() -> N
         like(*typed)
     Path("own.csv").write_text("\n".join(row for row in ROWS if not row.endswith(",")))
     assert like(*typed)[0].noise == ib.noise.Colored(deviation=0.3, correlation=0.5)
+
+
+@pytest.mark.parametrize("word", ["find=[c]", "++find=[c]", "+gate=0.999"])
+def test_filters_are_the_standard_of_what_only_filters_answer(word: str) -> None:
+    assert "tracker=[ekf,ukf]" in standard_words([word])
