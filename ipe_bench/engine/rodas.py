@@ -384,7 +384,8 @@ class _Run:
         return _sums(np.abs(moved))
 
     def _point(self, lanes: Array, later: int = 0) -> list[Any]:
-        """Returns t, y, p and c of each lane, as programs take them."""
+        """Returns t, y, p and c of each lane, as programs take them; `later` as in
+        `_constants`."""
         return [self.t[lanes], *self.y[:, lanes], *self._held(lanes, later)]
 
     def _held(self, lanes: Array, later: int = 0) -> list[Any]:
@@ -392,8 +393,8 @@ class _Run:
         return [*self.p[:, lanes], *self._constants(lanes, later)]
 
     def _constants(self, lanes: Array, later: int = 0) -> Array:
-        """Returns the constants of the interval to the next time of each lane, or those that hold
-        from that time on."""
+        """Returns the constants of the interval that ends at the next time of each lane or, if
+        `later` is 1, of the interval that begins there; tables[i] holds up to times[i]."""
         last = len(self.tables) - 1
         interval = np.minimum(self.place[lanes] + later, last)
         return self.tables[interval, self.case[lanes]].T

@@ -70,7 +70,12 @@ numbers that vary by little of themselves, the direction tells nothing, and that
 @dataclass(frozen=True)
 class Judged:
     """A function of rows (rows, n) that knows its slopes: those of complex steps where differences
-    do not contradict them, else those of differences."""
+    do not contradict them, else those of differences.
+
+    Complex steps are tried unless `why` is given; `noise` is what they need not tell. Differences
+    are central ones of `steps` if these are given, else three that must agree `within` a part, or
+    a whole ladder.
+    """
 
     function: Rows
     scale: Array
@@ -124,7 +129,8 @@ class Judged:
 
     @property
     def differences_cost(self) -> float:
-        """Calls of a row's differences, but where they doubt themselves."""
+        """Calls of a row's differences, but where they doubt themselves: three central differences
+        of a number in `by_differences`, one in `by_steps`."""
         each = 6 if self.steps is None else 2
         return float(each * len(self.scale) + 1)
 
@@ -191,7 +197,7 @@ class Judged:
     def contradicted(self, x: Array, J: Array) -> Mask:
         """Finds the rows (rows,) of x with a slope that differences along each number find wrong,
         and narrow ones do not find right: next to a kink wide ones take the slopes of both
-        sides."""
+        sides. In a rough function narrow ones may find right by chance, in about one of fifteen."""
         wrong = self._verdicts(x, J, 1.0) == WRONG
         rows = np.flatnonzero(wrong.any(axis=(1, 2)))
         if rows.size:
