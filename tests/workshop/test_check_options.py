@@ -91,7 +91,8 @@ BAD = {
                        "did you mean gaussian"),
     "of another group": ({"noise/bad": "defaults: [{prior: gaussian}]\n"}, "noise/bad",
                          "no such option of noise"),
-    "no list": ({"noise/bad": "defaults: gaussian\n"}, "noise/bad", "no such option of noise"),
+    "no list": ({"noise/bad": "defaults: gaussian\n"}, "noise/bad",
+                "is no list; write defaults: [gaussian]"),
 }  # fmt: skip
 
 
